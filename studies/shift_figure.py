@@ -23,7 +23,8 @@ from lagbench.board.model import OnShift, ReferenceRow, Tab
 from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, UsageError
 from lagbench.figures.chart import AxisScale, Plot, Spot, Tick, close_logarithmic
-from lagbench.figures.html import Markup, words
+from lagbench.figures.html import Markup
+from lagbench.figures.numbers import words
 from lagbench.figures.tables import markdown
 
 from .panels import join_charts

@@ -26,7 +26,8 @@ from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder, weights_path
 from lagbench.errors import LagbenchError, UsageError, format_count
 from lagbench.figures.chart import Plot, Spot, close_logarithmic
-from lagbench.figures.html import Markup, words
+from lagbench.figures.html import Markup
+from lagbench.figures.numbers import words
 from lagbench.figures.tables import markdown
 
 from .panels import join_charts

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.figures.html import MISSING, sentence, text, words
+from lagbench.figures.numbers import MISSING, sentence, text, words
 from lagbench.metrics.metric import Direction, Metric, mean
 
 from .entry import EntryBudget, EntryCost, Level

@@ -22,7 +22,8 @@ from lagbench.figures.chart import (
     close_logarithmic,
     key_height,
 )
-from lagbench.figures.html import Markup, tag, text, words
+from lagbench.figures.html import Markup, tag
+from lagbench.figures.numbers import text, words
 from lagbench.metrics.table import METRICS, ranking_metric
 from lagbench.references.shipped import shipped, solver_seconds
 from lagbench.references.table import REFERENCES

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from lagbench.figures.html import text
+from lagbench.figures.numbers import text
 from lagbench.metrics.significance import rank_ranges
 from lagbench.references.predictor import Kind
 

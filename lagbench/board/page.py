@@ -19,17 +19,8 @@ from itertools import groupby
 from lagbench.addresses import DOCUMENTATION
 from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import DARK, LIGHT, format_variables
-from lagbench.figures.html import (
-    DIGITS,
-    Markup,
-    clipped,
-    escaped,
-    join,
-    load_style_sheet,
-    tag,
-    text,
-    words,
-)
+from lagbench.figures.html import Markup, clipped, escaped, join, load_style_sheet, tag
+from lagbench.figures.numbers import DIGITS, text, words
 from lagbench.metrics.metric import Direction, Metric
 
 from .columns import (

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lagbench.data.box import Box
 from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import MATERIAL_COLOURS
-from lagbench.figures.html import MISSING, text, words
+from lagbench.figures.numbers import MISSING, text, words
 from lagbench.figures.solid import View
 from lagbench.scoring.scenario import spaced
 

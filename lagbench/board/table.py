@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lagbench.figures.html import MISSING, Markup, interval, join, tag, text
+from lagbench.figures.html import Markup, interval, join, tag
+from lagbench.figures.numbers import MISSING, text
 from lagbench.metrics.metric import Direction
 
 from .columns import Column, format_ranks

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from lagbench.data.checksums import round_digits
-from lagbench.figures.html import text
+from lagbench.figures.numbers import text
 from lagbench.metrics.metric import Direction, Metric
 
 from .columns import (

@@ -28,7 +28,8 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
-from lagbench.figures.plot import plot_frame
+from lagbench.figures.canvas import save
+from lagbench.figures.plot import draw_frame
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import VerificationResult, verify
 from lagbench.scoring.card import ScoreCard
@@ -186,7 +187,8 @@ def demo_split(
     picture_folder.mkdir(exist_ok=True)
     scenario_file = size.path(folder, size.subsets["test"][0])
     frame = size.task.frames_of_interest[-1]
-    picture = plot_frame(scenario_file, frame, picture_folder / f"{split}.png")
+    drawn = draw_frame(scenario_file, frame)
+    picture = save(drawn, picture_folder / f"{split}.png")
     return DemoResult(generation=generation, verification=verification, picture=picture)
 
 

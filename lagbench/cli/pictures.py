@@ -10,6 +10,8 @@ from lagbench.data.local import locate
 from lagbench.errors import UsageError
 from lagbench.figures.pictures import (
     animate,
+    data_name,
+    find_scenario,
     plot,
     require_place,
 )
@@ -63,13 +65,15 @@ def plot_command(
         require_place(page, overwrite=overwrite)
         path = contact_sheet(split, tier.name, page, root=root, kind=kind)
     else:
-        path = plot(
+        file = find_scenario(split, size=size, scenario=scenario, root=root)
+        path = output or Path(f"{data_name(file)}.png")
+        plot(
             split,
             size=size,
             scenario=scenario,
             frame=LAST_FRAME if frame is None else frame,
             kind=kind,
-            output=output,
+            output=path,
             overwrite=overwrite,
             root=root,
         )

@@ -123,7 +123,7 @@ Version = Annotated[str, Field(pattern=r"^[1-9]\d*\.\d+\.\d+$")]
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
 
-CARD_BYTES = 150_000
+CARD_BYTES = 800_000
 """Bytes that manifest, card and pictures of a data set have at most."""
 
 CARD_ROW_BYTES = 20_000

@@ -1,13 +1,12 @@
-"""A scenario as a moving picture: MP4 or GIF, one or two scenarios side by side.
+"""A scenario as a film: MP4 or GIF, one or two scenarios side by side.
 
-Needs ``pip install 'lagbench[plots]'``. Frames are read, painted and encoded one at a
-time, so memory does not grow with the length of a film. Files appear whole or not at
-all.
+Needs ``pip install 'lagbench[plots]'``. Frames are read, drawn and encoded one at a
+time. Files appear whole or not at all, and the same frames give the same bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,17 +17,16 @@ from rich.console import Console
 from rich.progress import track
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import UsageError, format_count, suggest_name
+from lagbench.errors import UsageError, require
 from lagbench.work.run import watched
 
-from .canvas import DPI, figure, pixels_of, renamed, shrink
-from .colours import INK, MUTED
-from .encoders import encode_gif, encode_mp4
-from .painter import Painter, unpack
+from .canvas import DPI, figure, pixels_of, shrink
+from .colours import MUTED
 from .panels import (
     FEW_NODES,
     Panel,
     colour_bar,
+    draw,
     draw_material_key,
     limit_of,
     median_limit,
@@ -40,8 +38,6 @@ from .recording import Recording, open_recording
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Registry
-
-__all__ = ["KINDS", "SUFFIXES", "animate", "check_ending"]
 
 SUFFIXES = (".mp4", ".gif")  # endings of the files that can be written
 KINDS = (Panel.SPEED, Panel.MATERIAL, Panel.VORTICITY)  # what an animation can show
@@ -59,11 +55,11 @@ MARGIN = 24
 TOP = 84
 BOTTOM = 76
 BAR = 300  # length of the colour bar
-# cell of a letter of the counter
-LETTER_WIDTH = 10
-LETTER_HEIGHT = 20
 
-LETTERS = "0123456789.frames "  # letters of the counter
+CODING = ("-crf", "20", "-preset", "veryfast", "-movflags", "+faststart")
+NO_DATES = ("-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact")
+
+SHORTEST_DELAY = 20  # viewers slow a GIF down below two hundredths of a second [ms]
 
 
 def animate(
@@ -78,8 +74,6 @@ def animate(
     registry: Registry | None = None,
 ) -> Path:
     """Turn a scenario into an MP4 or GIF file; return its path.
-
-    The file appears whole or not at all.
 
     Args:
         source: scenario file.
@@ -102,8 +96,19 @@ def animate(
     """
     path = Path(output)
     check_ending(path)
-    _check_kind(kind)
-    _check_pace(frames_per_second, every)
+    if kind is not None and kind not in KINDS:
+        raise UsageError(
+            f"a film cannot show {str(kind)!r}; choose {', '.join(KINDS)}",
+            where="--kind",
+        )
+    if not SLOWEST <= frames_per_second <= FASTEST:
+        raise UsageError(
+            f"a film cannot show {frames_per_second} frames per second; give "
+            f"{SLOWEST:g} to {FASTEST:g}",
+            where="--fps",
+        )
+    if every < 1:
+        raise UsageError(f"no step of {every} frames; give 1 or more", where="--every")
     sources = [source]
     if beside is not None:
         sources.append(beside)
@@ -113,21 +118,20 @@ def animate(
         for file in sources:
             recording = stack.enter_context(open_recording(file, registry=registry))
             recordings.append(recording)
-        film = Film(recordings, _choose_panel(kind, recordings))
-
-        temporary = stack.enter_context(atomic_path(path, option="--output"))
-        if path.suffix.lower() == ".gif":
-            encoder = encode_gif(temporary, rate=frames_per_second)
-        else:
-            encoder = encode_mp4(temporary, size=film.size, rate=frames_per_second)
-        write = stack.enter_context(encoder)
-
         frame_count = min(recording.frames for recording in recordings)
         numbers: Iterable[int] = range(0, frame_count, every)
         if not quiet and watched():
-            numbers = _show_progress(numbers, path.name)
-        for number in numbers:
-            write(film.frame(number))
+            console = Console(stderr=True)
+            numbers = track(
+                numbers, description=path.name, console=console, transient=True
+            )
+        frames = draw_film(recordings, _choose_panel(kind, recordings), numbers)
+
+        temporary = stack.enter_context(atomic_path(path, option="--output"))
+        if path.suffix.lower() == ".gif":
+            _encode_gif(temporary, frames, rate=frames_per_second)
+        else:
+            _encode_mp4(temporary, frames, rate=frames_per_second)
     return path
 
 
@@ -139,37 +143,9 @@ def check_ending(path: Path) -> None:
     """
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(
-            "no such kind of video",
+            f"films are MP4 or GIF files, not {path.name}; name it "
+            f"{path.stem or 'film'}.mp4",
             where="--output",
-            expected=f"a name ending in {' or '.join(SUFFIXES)}",
-            got=path,
-            fix=f"name it {renamed(path, SUFFIXES[0])}",
-        )
-
-
-def _check_kind(kind: Panel | str | None) -> None:
-    if kind is not None and kind not in KINDS:
-        fix = suggest_name(str(kind), map(str, KINDS))
-        raise UsageError(
-            f"an animation cannot show {str(kind)!r}",
-            where="--kind",
-            expected=", ".join(KINDS),
-            got=ascii(str(kind)),
-            fix=fix,
-        )
-
-
-def _check_pace(frames_per_second: float, every: int) -> None:
-    is_rate = SLOWEST <= frames_per_second <= FASTEST  # nan lies in no interval
-    is_step = isinstance(every, int | np.integer) and every >= 1
-    if not (is_rate and is_step):
-        raise UsageError(
-            "an animation needs a positive rate and step",
-            where="--fps, --every",
-            expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every whole number "
-            "from 1 on",
-            got=f"{frames_per_second} frames/s, every {every}",
-            fix="leave both out, or give numbers in these ranges",
         )
 
 
@@ -181,113 +157,124 @@ def _choose_panel(kind: Panel | str | None, recordings: Sequence[Recording]) -> 
     return Panel.SPEED
 
 
-def _show_progress(numbers: Iterable[int], name: str) -> Iterable[int]:
-    """Return the same numbers; a bar on stderr shows how many are done."""
-    console = Console(stderr=True)
-    return track(numbers, description=name, console=console, transient=True)
+def _encode_mp4(
+    path: Path, frames: Iterator[NDArray[np.uint8]], *, rate: float
+) -> None:
+    """Write frames to an MP4 file through the ffmpeg of imageio."""
+    ffmpeg = require("imageio_ffmpeg", extra="plots")
+    first = next(frames)
+    height, width, _ = first.shape
+    writer = ffmpeg.write_frames(
+        str(path),
+        (width, height),
+        fps=rate,
+        codec="libx264",
+        quality=None,
+        macro_block_size=2,
+        output_params=[*CODING, *NO_DATES, "-f", "mp4"],
+    )
+    writer.send(None)
+    writer.send(first)
+    for frame in frames:
+        writer.send(frame)
+    writer.close()
 
 
-class Film:
-    """Composes the frames: a still background, one panel per recording, a counter."""
+def _encode_gif(
+    path: Path, frames: Iterator[NDArray[np.uint8]], *, rate: float
+) -> None:
+    """Write frames to a GIF file that repeats for ever, with the palette of the first.
 
-    def __init__(self, recordings: Sequence[Recording], panel: Panel) -> None:
-        """Choose slices and a colour scale, and draw all that does not move.
+    Rates are rounded to hundredths of a second.
+    """
+    images = require("PIL.Image", extra="plots")
+    first = images.fromarray(next(frames)).quantize(256)
 
-        Raises:
-            UsageError: a recording has no vorticity to show.
-        """
-        self._recordings = recordings
-        self._panel = panel
-        if panel is Panel.VORTICITY:
-            for recording in recordings:
-                frames = _sample_frames(recording)
-                recording.fix_slice(frames)
-                _check_vorticity(recording, frames)
-        self._limit = _common_limit(recordings, panel)
+    def reduce() -> Iterator[object]:
+        for frame in frames:
+            exact = images.fromarray(frame)
+            yield exact.quantize(palette=first, dither=images.Dither.NONE)
 
-        # The panels stand side by side.
-        self._painters = []
-        self._lefts = []  # left side of each panel [pixel]
-        left = MARGIN
+    first.save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=reduce(),
+        duration=max(SHORTEST_DELAY, 10 * round(100.0 / rate)),
+        loop=0,
+    )
+
+
+def draw_film(
+    recordings: Sequence[Recording], panel: Panel, numbers: Iterable[int]
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield frames of a film as RGB bytes, shape [row, column, 3].
+
+    The recordings stand side by side with one colour scale; a counter at the bottom
+    shows frame and time.
+
+    Raises:
+        UsageError: a recording has no vorticity to show.
+    """
+    if panel is Panel.VORTICITY:
         for recording in recordings:
-            painter = Painter(recording, panel, side=SIDE, limit=self._limit)
-            self._painters.append(painter)
-            self._lefts.append(left)
-            left += SIDE + GAP
+            frames = _sample_frames(recording)
+            recording.fix_slice(frames)
+            _check_vorticity(recording, frames)
+    limit = _common_limit(recordings, panel)
+    width = 2 * MARGIN + len(recordings) * (SIDE + GAP) - GAP
+    height = TOP + SIDE + BOTTOM
+    with figure(width / DPI, height / DPI) as drawn:
+        titles = dict.fromkeys(recording.title for recording in recordings)
+        title = drawn.text(
+            MARGIN / width,
+            1 - 14 / height,
+            " | ".join(titles),
+            fontsize=12,
+            fontweight="bold",
+            va="top",
+        )
+        shrink(title, (width - 2 * MARGIN) / DPI)
+        panels = []
+        for number, recording in enumerate(recordings):
+            left = MARGIN + number * (SIDE + GAP)
+            name = describe(recording)
+            if panel is Panel.VORTICITY and recording.is_solid:
+                name = f"{name}{SEPARATOR}{name_slice(recording.scene(0))}"
+            y = 1 - (TOP - 12) / height
+            text = drawn.text(left / width, y, name, fontsize=9, color=MUTED)
+            shrink(text, SIDE / DPI)
+            place = (left / width, BOTTOM / height, SIDE / width, SIDE / height)
+            panels.append(drawn.add_axes(place))
 
-        width = self._lefts[-1] + SIDE + MARGIN
-        height = TOP + SIDE + BOTTOM
-        self.size = (width, height)
-        self._background = self._draw_background()
+        bar_bottom = (BOTTOM - 24) / height
+        place = (MARGIN / width, bar_bottom, BAR / width, 10 / height)
+        below = drawn.add_axes(place)
+        if panel is Panel.MATERIAL:
+            materials = [recording.material for recording in recordings]
+            draw_material_key(below, np.concatenate(materials))
+        else:
+            colour_bar(below, panel, limit, is_solid=recordings[0].is_solid)
+        counter = drawn.text(
+            1 - MARGIN / width,
+            bar_bottom,
+            "",
+            fontsize=8.5,
+            family="DejaVu Sans Mono",
+            ha="right",
+        )
 
-        # The counter of each frame is composed of these pictures.
-        self._counter_letters = {}
-        for letter in LETTERS:
-            self._counter_letters[letter] = _draw_letter(letter)
-
-    def frame(self, number: int) -> NDArray[np.uint8]:
-        """Return one frame as RGB bytes, shape [row, column, 3]."""
-        image = self._background.copy()
-        for recording, painter, left in zip(
-            self._recordings, self._painters, self._lefts, strict=True
-        ):
-            scene = recording.scene(number)
-            panel = unpack(painter.paint(scene))
-            image[TOP : TOP + SIDE, left : left + SIDE] = panel
-
-        # the counter stands at the bottom right
-        text = self._counter_text(number)
-        letters = [self._counter_letters[letter] for letter in text]
-        counter = np.concatenate(letters, axis=1)
-        right = self.size[0] - MARGIN
-        left = right - counter.shape[1]
-        top = TOP + SIDE + 12
-        image[top : top + LETTER_HEIGHT, left:right] = counter
-        return image
-
-    def _counter_text(self, number: int) -> str:
-        """Return frame number and time, as wide as those of the last frame."""
-        interval = self._recordings[0].size.frame_interval
-        last = self._recordings[0].frames - 1
+        interval = recordings[0].size.frame_interval
+        last = recordings[0].frames - 1
         number_width = len(str(last))
         time_width = len(f"{last * interval:.2f}")
-        time = number * interval
-        return f"frame {number:>{number_width}}  {time:>{time_width}.2f} s"
-
-    def _draw_background(self) -> NDArray[np.uint8]:
-        """Return title, names of the scenarios and colour bar or key as RGB bytes."""
-        width, height = self.size
-        with figure(width / DPI, height / DPI) as drawn:
-            titles = dict.fromkeys(recording.title for recording in self._recordings)
-            title = drawn.text(
-                MARGIN / width,
-                1 - 14 / height,
-                " | ".join(titles),
-                fontsize=12,
-                fontweight="bold",
-                va="top",
-            )
-            shrink(title, (width - 2 * MARGIN) / DPI)
-            name_height = 1 - (TOP - 12) / height
-            for recording, left in zip(self._recordings, self._lefts, strict=True):
-                name = describe(recording)
-                if self._panel is Panel.VORTICITY and recording.is_solid:
-                    name = f"{name}{SEPARATOR}{name_slice(recording.scene(0))}"
-                text = drawn.text(
-                    left / width, name_height, name, fontsize=9, color=MUTED
-                )
-                shrink(text, SIDE / DPI)
-
-            bar_bottom = (BOTTOM - 24) / height
-            place = (MARGIN / width, bar_bottom, BAR / width, 10 / height)
-            below = drawn.add_axes(place)
-            if self._panel is Panel.MATERIAL:
-                materials = [recording.material for recording in self._recordings]
-                draw_material_key(below, np.concatenate(materials))
-            else:
-                is_solid = self._recordings[0].is_solid
-                colour_bar(below, self._panel, self._limit, is_solid=is_solid)
-            return pixels_of(drawn)
+        for number in numbers:
+            for axes, recording in zip(panels, recordings, strict=True):
+                axes.clear()
+                draw(axes, panel, recording.scene(number), limit=limit)
+            time = f"{number * interval:>{time_width}.2f} s"
+            counter.set_text(f"frame {number:>{number_width}}  {time}")
+            yield pixels_of(drawn)
 
 
 def _common_limit(recordings: Sequence[Recording], panel: Panel) -> float:
@@ -316,16 +303,12 @@ def _check_vorticity(recording: Recording, frames: Sequence[int]) -> None:
     for frame in frames:
         count = int(np.isfinite(recording.scene(frame).vorticity).sum())
         most = max(most, count)
-    if most >= FEW_NODES:
-        return
-    raise UsageError(
-        "there is no vorticity to show: material is too thin for the grid",
-        where="--kind",
-        expected=f"{FEW_NODES} nodes of the grid with a vorticity; or speed or "
-        "material, which need no grid",
-        got=f"vorticity, which at most {format_count(most, 'node')} of a frame has",
-        fix="leave --kind out",
-    )
+    if most < FEW_NODES:
+        raise UsageError(
+            f"material is too thin for the grid: at most {most} nodes of a frame have "
+            "a vorticity; show speed or material",
+            where="--kind",
+        )
 
 
 def _sample_frames(recording: Recording) -> list[int]:
@@ -333,18 +316,3 @@ def _sample_frames(recording: Recording) -> list[int]:
     numbers = np.linspace(0, recording.frames - 1, SAMPLES).astype(int)
     frames: list[int] = np.unique(numbers).tolist()
     return frames
-
-
-def _draw_letter(letter: str) -> NDArray[np.uint8]:
-    """Return a letter of the counter as RGB bytes, shape [row, column, 3]."""
-    with figure(LETTER_WIDTH / DPI, LETTER_HEIGHT / DPI) as drawn:
-        drawn.text(
-            0.5,
-            0.25,
-            letter,
-            fontsize=8.5,
-            family="DejaVu Sans Mono",
-            ha="center",
-            color=INK,
-        )
-        return pixels_of(drawn)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .html import Markup, clipped, format_multiples, format_power, join, path_data, tag
+from .html import Markup, clipped, format_multiples, join, path_data, tag
 from .labels import (
     ANCHORS,
     LINE_HEIGHT,
@@ -25,6 +25,7 @@ from .labels import (
     place_labels,
     wrap_name,
 )
+from .numbers import format_power
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float]

@@ -9,16 +9,13 @@ signs, words. Figures consist of keys, tables, and panels side by side.
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from unicodedata import east_asian_width
 
-from lagbench.metrics.metric import Metric
-
 from .colours import format_schemes
+from .numbers import _format_minus, text
 
 # elements of HTML without an end tag
 VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})
@@ -126,45 +123,6 @@ def load_style_sheet() -> str:
     return format_schemes() + rules
 
 
-MISSING = "–"  # stands where there is no number
-DIGITS = 3  # significant digits
-PLAIN_POWERS = range(-3, 5)  # powers of ten of numbers that are written out
-
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def format_power(exponent: int) -> str:
-    """Return a power of ten.
-
-    >>> format_power(-4)
-    '10⁻⁴'
-    """
-    return f"10{str(exponent).translate(_RAISED)}"
-
-
-def text(value: float, digits: int = DIGITS) -> str:
-    """Return a number with so many significant digits.
-
-    >>> text(0.012345), text(-2.5e-7), text(1200000.0), text(20.0), text(math.nan)
-    ('0.0123', '−2.50×10⁻⁷', '1.20×10⁶', '20', '–')
-    """
-    if math.isnan(value):
-        return MISSING
-    if math.isinf(value):
-        return _format_minus(f"{value}".replace("inf", "∞"))
-    if value == 0.0:
-        return "0"
-    if value == int(value) and abs(value) < 10.0**PLAIN_POWERS.stop:
-        return _format_minus(str(int(value)))
-    # rounding may raise the power: 0.99999 is 1.00
-    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-    order = int(exponent)
-    if order in PLAIN_POWERS:
-        rounded = float(f"{mantissa}e{order}")
-        return _format_minus(f"{rounded:.{max(0, digits - 1 - order)}f}")
-    return f"{_format_minus(mantissa)}×{format_power(order)}"
-
-
 def wrap_number(value: float) -> Markup:
     """Return a number as markup that keeps together."""
     return tag("span", text(value), class_="n")
@@ -197,38 +155,6 @@ def format_multiples(values: Sequence[float], step: float) -> list[str]:
     return labels
 
 
-def _format_minus(number: str) -> str:
-    return number.replace("-", "−")
-
-
-_PARTS_OF_NAMES = {
-    "mse": "MSE",
-    "mae": "MAE",
-    "rmse": "RMSE",
-    "nrmse": "NRMSE",
-    "kl": "KL",
-    "w1": "W1",
-    "w2": "W2",
-    "pearson": "correlation",
-    "avg": "average",
-    "hist": "histogram",
-    "abs": "magnitudes",
-}
-
-
-def words(name: str, *, capital: bool = False) -> str:
-    """Return the name of a metric as words.
-
-    >>> words("vorticity_rmse"), words("mse_avg"), words("energy_error", capital=True)
-    ('vorticity RMSE', 'MSE average', 'Energy error')
-    """
-    parts = [_PARTS_OF_NAMES.get(part, part) for part in name.split("_")]
-    phrase = " ".join(parts)
-    if capital:
-        return phrase[0].upper() + phrase[1:]
-    return phrase
-
-
 def clipped(name: str, room: int = 34) -> str:
     """Return a name that takes no more room than so many narrow letters.
 
@@ -247,73 +173,6 @@ def clipped(name: str, room: int = 34) -> str:
     if width <= room:
         return name
     return f"{name[:fitting]}…"
-
-
-def format_unit(metric: Metric) -> str:
-    """Return the unit in brackets with a space before it, nothing for pure numbers."""
-    if metric.unit == "1":
-        return ""
-    return f" [{metric.unit.replace('^2', '²')}]"
-
-
-def format_quantity(metric: Metric) -> str:
-    """Return the label of an axis: name and unit."""
-    return words(metric.name) + format_unit(metric)
-
-
-def sentence(metric: Metric) -> str:
-    """Return a metric's summary, unit and source as one sentence."""
-    summary = metric.summary[0].upper() + metric.summary[1:]
-    return f"{summary}{format_unit(metric)} ({metric.source})."
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportFigure:
-    """One figure of a page."""
-
-    name: str  # identifier, unique on the page
-    title: str  # what it shows, a few words
-    thesis: str  # the figure of the thesis that it corresponds to, as in "Fig. 5.10"
-    body: Markup  # the drawing, with its key
-    caption: str  # what it shows, units, how to read it
-    wide: bool = False  # whether it takes the whole width
-    data: Markup | None = None  # its numbers as a table, where that is cheap
-
-
-def draw_key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
-    """Return the key of a figure.
-
-    Args:
-        items: classes of each mark, and its meaning.
-        kind: "line" or "square", the shape of the marks.
-    """
-    drawn = []
-    for mark, name in items:
-        swatch = _draw_swatch(mark, kind)
-        drawn.append(tag("li", swatch, tag("span", name)))
-    return tag("ul", *drawn, class_="key")
-
-
-def _draw_swatch(mark: str, kind: str) -> Markup:
-    if kind == "square":
-        shape = tag(
-            "rect",
-            x=5,
-            y=0,
-            width=12,
-            height=10,
-            rx=2,
-            class_=f"bar {mark}",
-        )
-    else:
-        shape = tag("path", d="M1 5H21", class_=f"line {mark}")
-    return tag(
-        "svg",
-        shape,
-        viewBox="0 0 22 10",
-        class_="swatch",
-        aria_hidden="true",
-    )
 
 
 def draw_table(
@@ -352,80 +211,3 @@ def draw_table(
 def paragraph(*parts: object) -> Markup:
     """Return a paragraph."""
     return tag("p", join(parts))
-
-
-SIDE = 200  # side of the coordinates of a panel of lines
-
-
-def draw_panel_grid(
-    columns: Sequence[object],
-    rows: Sequence[tuple[str, Sequence[Markup]]],
-    *,
-    width: float = 6.6,
-) -> Markup:
-    """Return named rows of panels in a grid that scrolls sideways on narrow screens.
-
-    The width is that of the narrowest panel [rem].
-    """
-    cells = [tag("span")]
-    for column in columns:
-        cells.append(tag("span", column, class_="time"))
-    for name, panels in rows:
-        cells.append(tag("span", name, class_="side"))
-        cells += panels
-    tracks = f"minmax(5.2rem,6.5rem) repeat({len(columns)},minmax({width}rem,1fr))"
-    style = f"grid-template-columns:{tracks}"
-    drawn = tag("div", *cells, class_="panels", style=style)
-    return tag("div", drawn, class_="scroll", tabindex=0)
-
-
-def draw_image_panel(
-    png: bytes, kind: str, alt: str, *, smooth: bool = False, aspect: float = 1.0
-) -> Markup:
-    """Return a panel that shows a picture of the inside of the box.
-
-    Args:
-        png: the picture.
-        kind: classes of the panel, which tell the walls that move.
-        alt: the picture in words.
-        smooth: whether browsers may blur it when they enlarge it.
-        aspect: width over height of the box.
-    """
-    source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
-    image_kind = None
-    if smooth:
-        image_kind = "smooth"
-    drawn = tag("img", src=source, alt=alt, class_=image_kind)
-    return tag("span", drawn, class_=kind, style=_aspect_style(aspect))
-
-
-def draw_line_panel(
-    drawn: Markup, kind: str, alt: str, *, aspect: float = 1.0
-) -> Markup:
-    """Return a panel of lines in coordinates from 0 to :data:`SIDE`, left to right.
-
-    The aspect is width over height of the box.
-    """
-    box = f"0 0 {SIDE} {SIDE / aspect:g}"
-    title = tag("title", alt)
-    svg = tag("svg", title, drawn, viewBox=box, class_="flow", role="img")
-    return tag("span", svg, class_=kind, style=_aspect_style(aspect))
-
-
-def _aspect_style(aspect: float) -> str | None:
-    """Return the style of a panel of a box that is no square; None for a square."""
-    if aspect == 1.0:
-        return None
-    return f"aspect-ratio:{aspect:.4g}"
-
-
-def draw_ramp(kind: str, limit: float, unit: str, *, signed: bool = False) -> Markup:
-    """Return the key of a colour scale."""
-    if signed:
-        low = f"−{text(limit)}"
-    else:
-        low = "0"
-    bar = tag("span", class_=f"ramp {kind}")
-    scale = join([low, bar, text(limit)], " ")
-    unit_label = tag("span", unit, class_="muted")
-    return tag("p", scale, unit_label, class_="scale")

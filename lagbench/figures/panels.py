@@ -19,7 +19,6 @@ from lagbench.errors import require
 
 from .canvas import build_speed_map, build_vorticity_map
 from .colours import INK, MATERIAL_COLOURS, MOVING, MUTED, PAPER, WALL
-from .particles import DOT_DIAMETER, DOT_DIAMETER_SOLID
 from .recording import Recording, Scene
 from .solid import SLICE, View, shade
 
@@ -97,6 +96,11 @@ def place_of_slice(scene: Scene) -> float:
         return float(size.box.centre[2])
     return float(size.field_grid.places(2)[scene.layer])
 
+
+# diameter of a drawn particle in particle spacings: neighbours overlap a little
+DOT_DIAMETER = 1.25
+# the same of a cube: smaller dots leave what is behind them visible
+DOT_DIAMETER_SOLID = 0.75
 
 # particles drawn at the most; more would take memory and no eye would tell
 MOST_DOTS = 1 << 16

@@ -19,11 +19,12 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.store.copy import update_working_copy
 
 from . import animate as films
-from .canvas import DPI
-from .plot import ALL, check_kind, plot_frame
-from .recording import open_recording
+from .canvas import DPI, check_picture_name, save
+from .plot import ALL, check_kind, draw_frame
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from lagbench.data.registry import Registry
 
 SCENARIO_ENDING = ".nc"  # of a source that is a file, not a split
@@ -44,8 +45,8 @@ def plot(
     dpi: float = DPI,
     root: str | Path | None = None,
     registry: Registry | None = None,
-) -> Path:
-    """Draw one frame of a scenario; return the path of the picture.
+) -> Figure:
+    """Draw one frame of a scenario; a notebook shows the figure.
 
     Args:
         source: name of the split, path of a local split's folder, or a scenario file.
@@ -56,8 +57,7 @@ def plot(
         kind: all (three panels), speed, material, vorticity or streamlines; in three
             dimensions also front or above. Of a free surface kind ``all`` shows these
             two.
-        output: file to write, ending in .png, .pdf or .svg; named after the data in the
-            working folder when None.
+        output: file to write too, ending in .png, .pdf or .svg.
         overwrite: whether to replace a file of that name.
         dpi: pixels per inch.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
@@ -70,19 +70,18 @@ def plot(
         UnreadableFileError: the named file is no scenario file.
     """
     check_kind(kind)
-    if _is_file(source):
-        source = expand_home(source, "source")
     file = find_scenario(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
-    named_files = [source] if _is_file(source) else []
-    with _blame_named_files(*named_files):
-        if output is None:
-            path = _frame_path(file, frame)
-        else:
-            path = expand_home(output, "output")
+    path = None
+    if output is not None:
+        path = check_picture_name(expand_home(output, "output"))
         require_place(path, overwrite=overwrite)
-        return plot_frame(file, frame, path, kind=kind, dpi=dpi, registry=registry)
+    with _blame_named_files(source):
+        drawn = draw_frame(file, frame, kind=kind, dpi=dpi, registry=registry)
+    if path is not None:
+        save(drawn, path)
+    return drawn
 
 
 def animate(
@@ -126,18 +125,12 @@ def animate(
         UnreadableFileError: a named file is no scenario file.
         WorkFailedError: the video cannot be encoded or written.
     """
-    if output is not None:
-        films.check_ending(Path(output))
-    if _is_file(source):
-        source = expand_home(source, "source")
     file = find_scenario(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
     second: Path | None = None
-    named_files = [source] if _is_file(source) else []
     if isinstance(beside, str | Path):
         second = expand_home(beside, "beside")
-        named_files.append(second)
     elif beside is not None:
         second = find_scenario(
             source,
@@ -147,11 +140,12 @@ def animate(
             registry=registry,
         )
     if output is None:
-        path = Path(f"{_data_name(file)}.mp4")
+        path = Path(f"{data_name(file)}.mp4")
     else:
         path = expand_home(output, "output")
+    films.check_ending(path)
     require_place(path, overwrite=overwrite)
-    with _blame_named_files(*named_files):
+    with _blame_named_files(source, beside):
         return films.animate(
             file,
             path,
@@ -181,13 +175,10 @@ def find_scenario(
     if _is_file(source):
         if scenario is not None:
             raise UsageError(
-                "a file holds one scenario, and an id names another",
-                where="SPLIT|FILE and --scenario or --beside",
-                expected="a file alone, or a split and an id",
-                got=f"{source} and {scenario}",
-                fix="leave the id out, or name the split instead of the file",
+                f"{source} holds one scenario, and {scenario} names another; leave one "
+                "of them out"
             )
-        return Path(source)
+        return expand_home(source, "source")
     tier, folder, _ = locate(source, size, root=root, registry=registry)
     if scenario is None:
         scenario_id = tier.subsets["test"][0]
@@ -199,13 +190,8 @@ def find_scenario(
     update_working_copy(tier, folder, [scenario_id])
     path = tier.path(folder, scenario_id)
     if not has_file(path):
-        raise DataError(
-            f"scenario {scenario_id} is not there",
-            where=str(path),
-            expected="a scenario file of this size",
-            got="no such file",
-            fix=suggest_repair(tier, repair, root=folder),
-        )
+        fix = suggest_repair(tier, repair, root=folder)
+        raise DataError(f"scenario {scenario_id} is not there: no {path}; {fix}")
     return path
 
 
@@ -215,7 +201,7 @@ def _is_file(source: str | Path) -> bool:
 
 
 @contextmanager
-def _blame_named_files(*names: str | Path) -> Iterator[None]:
+def _blame_named_files(*sources: object) -> Iterator[None]:
     """Turn errors of damaged data into errors of the files that the user named.
 
     Raises:
@@ -226,17 +212,10 @@ def _blame_named_files(*names: str | Path) -> Iterator[None]:
         yield
     except DataError as error:
         place = error.where or ""
-        if not any(place.startswith(str(Path(name))) for name in names):
-            raise
-        raise UnreadableFileError(
-            error.what,
-            where=error.where,
-            expected=error.expected
-            or "a scenario file, as lagbench generate writes it",
-            got=error.got,
-            fix="name another file, or a split: lagbench plot cavity --size tiny; "
-            "predictions are drawn by lagbench score FILE --report FOLDER",
-        ) from error
+        for source in sources:
+            if isinstance(source, str | Path) and place.startswith(str(source)):
+                raise UnreadableFileError(error.text, where=error.where) from error
+        raise
 
 
 def require_place(path: Path, *, overwrite: bool) -> None:
@@ -247,22 +226,12 @@ def require_place(path: Path, *, overwrite: bool) -> None:
     """
     if not path.parent.is_dir():
         raise UsageError(
-            "there is no such folder",
-            where="--output",
-            expected="a file in a folder that exists",
-            got=path.parent,
-            fix="create it first",
+            f"there is no folder {path.parent}; create it first", where="--output"
         )
     check_output_file(path, overwrite=overwrite)
 
 
-def _frame_path(file: Path, frame: int) -> Path:
-    with open_recording(file) as recording:
-        frame_number = recording.frame_number(frame)
-    return Path(f"{_data_name(file)}-frame{frame_number}.png")
-
-
-def _data_name(file: Path) -> str:
+def data_name(file: Path) -> str:
     """Return split-size-scenario where the path names them, else the file's name."""
     parts = file.absolute().parts
     # A file of a data set lies at ROOT/SPLIT/SIZE/v1/SUBSET/SCENARIO.nc.

@@ -20,7 +20,7 @@ from lagbench.data.box import WALL_NAMES
 from lagbench.data.layout import has_file
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UsageError, suggest_name
+from lagbench.errors import DataError, UsageError
 from lagbench.store.copy import update_working_copy
 
 from .canvas import DPI, draw_header, figure, save, shrink
@@ -45,19 +45,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "KINDS",
-    "Panel",
-    "check_kind",
-    "contact_sheet",
-    "describe",
-    "draw_contact_sheet",
-    "plot_frame",
-]
-
 ALL = "all"
 KINDS = (ALL, *(str(panel) for panel in Panel))
-"""What :func:`plot_frame` can draw."""
+"""What :func:`draw_frame` can draw."""
 
 SEPARATOR = "  ·  "
 KIND_PARAMETERS = ("family", "pair")  # parameters that say of which kind a scenario is
@@ -98,45 +88,36 @@ WALL_SHARE = 0.6
 
 
 def check_kind(kind: str) -> None:
-    """Refuse a kind of picture that :func:`plot_frame` cannot draw.
+    """Refuse a kind of picture that :func:`draw_frame` cannot draw.
 
     Raises:
         UsageError: the kind is none of :data:`KINDS`.
     """
     if kind not in KINDS:
         raise UsageError(
-            f"no kind of picture {kind!r}",
-            where="--kind",
-            expected=", ".join(KINDS),
-            got=ascii(kind),
-            fix=suggest_name(kind, KINDS),
+            f"no kind of picture {kind!r}; choose {', '.join(KINDS)}", where="--kind"
         )
 
 
-def plot_frame(
+def draw_frame(
     source: str | Path | xr.Dataset,
     frame: int,
-    output: str | Path,
     *,
     kind: str = ALL,
     dpi: float = DPI,
     registry: Registry | None = None,
-    option: str = "--output",
-) -> Path:
-    """Draw one frame of a scenario; return the path of the file.
+) -> Figure:
+    """Draw one frame of a scenario; :func:`.canvas.save` writes the figure to a file.
 
     Args:
         source: scenario file, or a data set of one scenario.
         frame: absolute frame number; negative ones count from the end.
-        output: file to write, ending in .png, .pdf or .svg.
         kind: one of :data:`KINDS`; ``all`` draws three panels side by side.
         dpi: pixels per inch.
         registry: where splits are described; ours when None.
-        option: the option that names another place, for messages.
 
     Raises:
-        UsageError: unknown kind, no such frame, a name with another ending, no
-            matplotlib.
+        UsageError: unknown kind, no such frame, no matplotlib.
         DataError: the scenario file is missing or damaged.
     """
     check_kind(kind)
@@ -170,7 +151,7 @@ def plot_frame(
                 draw_material_key(below, recording.material)
             else:
                 colour_bar(below, panel, limit, is_solid=recording.is_solid)
-        return save(drawn, output, option=option)
+        return drawn
 
 
 def _choose_panels(kind: str, recording: Recording) -> list[Panel]:
@@ -190,12 +171,8 @@ def _check_view(panel: Panel, size: Size) -> None:
     """Refuse a view that a box of two dimensions does not have."""
     if panel in VIEWS and size.dimension == 2:
         raise UsageError(
-            f"there is no view {str(panel)!r} of two dimensions",
+            f"there is no view {str(panel)!r} of two dimensions; leave --kind out",
             where="--kind",
-            expected="all, speed, material, vorticity or streamlines",
-            got=str(panel),
-            fix=f"leave --kind out, or name a split of three dimensions: "
-            f"{size.split} has two",
         )
 
 
@@ -339,13 +316,9 @@ def draw_contact_sheet(
     """
     files = _list_existing_files(tier, folder)
     if not files:
-        where = f"{tier.split} {tier.name} under {folder}"
+        fix = suggest_repair(tier, root=folder)
         raise DataError(
-            "nothing to draw",
-            where=where,
-            expected="scenario files",
-            got="none",
-            fix=suggest_repair(tier, root=folder),
+            f"nothing to draw: no scenario of {tier.split} {tier.name} is there; {fix}"
         )
     kinds = _first_of_each_kind(files, registry)
     if kinds:

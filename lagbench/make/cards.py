@@ -105,7 +105,8 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
 def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
     """Paint a contact sheet of all scenarios and one frame of a test scenario."""
     # the drawing modules are loaded only where there is something to paint
-    from lagbench.figures.plot import draw_contact_sheet, plot_frame
+    from lagbench.figures.canvas import save
+    from lagbench.figures.plot import draw_contact_sheet, draw_frame
 
     registry = Registry({size.split: split}, {})
     folder = size.folder(root)
@@ -116,13 +117,8 @@ def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> 
 
     entry = _first_test_entry(manifest)
     frame = min(size.task.frames_of_interest[-1], entry.frames - 1)
-    plot_frame(
-        folder / entry.path,
-        frame,
-        folder / frame_name,
-        registry=registry,
-        option=ROOT_OPTION,
-    )
+    drawn = draw_frame(folder / entry.path, frame, registry=registry)
+    save(drawn, folder / frame_name, option=ROOT_OPTION)
 
 
 def _first_test_entry(manifest: Manifest) -> FileEntry:

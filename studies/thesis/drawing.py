@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import require
-from lagbench.figures.canvas import figure, pixels_of, png_bytes
+from lagbench.figures.canvas import encode, figure, pixels_of
 from lagbench.figures.colours import INK
 from lagbench.figures.panels import (
     Panel,
@@ -217,7 +217,7 @@ def panel_rows(rows: Sequence[PanelRow], frames: Sequence[int], panel: str) -> b
             bar_width = min(2.0, width - 0.6)
             place = (0.35 / width, 0.42 / height, bar_width / width, 0.08 / height)
             colour_bar(picture.add_axes(place), scale, limit)
-        return png_bytes(picture)
+        return encode(picture)
 
 
 def _common_limit(

@@ -26,8 +26,9 @@ from lagbench.figures.chart import (
     logarithmic,
     spanning,
 )
-from lagbench.figures.html import interval, text
+from lagbench.figures.html import interval
 from lagbench.figures.labels import LabelBox, place_joined_labels, place_labels
+from lagbench.figures.numbers import text
 
 PLOT_BOX = LabelBox(0.0, 0.0, 400.0, 200.0)
 

@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import numpy as np
-import PIL.Image
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.figures.canvas import (
-    build_palette,
-    build_speed_map,
-    build_vorticity_map,
-    choose_palette,
-    colour_bytes,
-    reduce_colours,
-)
 from lagbench.figures.solid import PALEST, RIM, View, shade
 
 CUBE = Box.from_bounds([(0.0, 1.0)] * 3)
@@ -93,36 +83,3 @@ def test_the_farthest_particle_is_the_palest() -> None:
     nearest, farthest = shade(black, depths, np.ones(3))
     assert_allclose(nearest, 0.0)
     assert_allclose(farthest, 1.0 - PALEST)
-
-
-def written_colours(image: PIL.Image.Image, palette: Any) -> NDArray[np.float64]:
-    """Return the colours of a picture as its file has them."""
-    reduced = reduce_colours(image, palette).convert("RGB")
-    return np.asarray(reduced).astype(float)
-
-
-def test_pale_particles_keep_their_hue() -> None:
-    """Speeds that fade into the paper are nearly the colours of the file."""
-    speeds = colour_bytes(build_speed_map()).astype(float)
-    paper = build_palette()[0].astype(float)
-    rows = []
-    for share in np.linspace(PALEST, 1.0, 25):
-        rows.append(share * speeds + (1.0 - share) * paper)
-    exact = np.array(rows).round().astype(np.uint8)
-    image = PIL.Image.fromarray(exact)
-    palette = choose_palette(image)
-    assert not np.array_equal(palette, build_palette())
-    difference = written_colours(image, palette) - exact
-    assert np.abs(difference).max() <= 24
-    mean_square = np.mean(difference**2)
-    assert np.sqrt(mean_square) <= 7
-
-
-def test_flat_pictures_keep_their_palette() -> None:
-    """A picture with signed vorticity has the palette that holds its colours."""
-    colours = colour_bytes(build_vorticity_map())[None]
-    image = PIL.Image.fromarray(colours)
-    palette = choose_palette(image)
-    assert_array_equal(palette, build_palette())
-    difference = written_colours(image, palette) - colours
-    assert np.abs(difference).max() <= 8

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,8 @@ from lagbench.data.local import locate
 from lagbench.data.scenario import read_scenario
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.figures.plot import KINDS, plot_frame
+from lagbench.figures.canvas import encode
+from lagbench.figures.plot import KINDS, draw_frame
 from lagbench.figures.report.report import write_report
 from lagbench.references.predictor import given_in
 from lagbench.references.table import REFERENCES
@@ -159,12 +159,7 @@ def test_pictures_and_report_are_drawn(made: LocalSplit, tmp_path: Path) -> None
     )
     page = write_report(tmp_path / "report", [card], [path], root=root)
     text = page.read_text("utf-8")
-    assert "a slice across z" in text
     assert "arrows" in text
-    size = locate(made.folder).size
-    node_counts = [int(count) for count in re.findall(r"(\d+) nodes", text)]
-    assert all(count <= size.task.score_grid.cells**3 for count in node_counts)
     scenario = locate(made.folder).size.path(root, 2)
     for kind in KINDS:
-        picture = plot_frame(scenario, 3, tmp_path / f"{kind}.png", kind=kind)
-        assert picture.stat().st_size > 2000
+        assert len(encode(draw_frame(scenario, 3, kind=kind))) > 2000

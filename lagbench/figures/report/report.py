@@ -1,30 +1,25 @@
-"""Compose the report and write it: one HTML file of sections and numbered figures.
+"""Compose the report and write it: one HTML file of pictures and tables.
 
-Nothing in it is fetched from anywhere: styles, drawings and pictures stand in the file,
-there is no script, and a content security policy forbids the browser to ask for more.
+Nothing in it is fetched from anywhere: styles and pictures stand in the file, there is
+no script, and a content security policy forbids the browser to ask for more.
 """
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
 from lagbench.atomic import check_writable, write_atomically
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.figures.html import (
-    Markup,
-    ReportFigure,
-    join,
-    load_style_sheet,
-    paragraph,
-    tag,
-    words,
-)
+from lagbench.figures.numbers import text, words
 from lagbench.scoring.card import ScoreCard
 
-from . import arrows, curves, distributions, maps, particles, summary, tables
+from . import pictures, tables
 from .subject import Gallery, Subject, load_subject, read_gallery
 
 FILE_NAME = "index.html"
@@ -33,25 +28,31 @@ POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
     "form-action 'none'"
 )
+"""What a browser may do with the page; no other page has this text."""
 
-OPEN_SECTIONS = 2
-"""Sections that are unfolded when the page is opened: the scores and the rollout."""
+TILES = ("vorticity_pearson", "stable_frames", "spectrum_error", "position_rmse_20")
+"""Metrics at the top, after skill and the metric that ranks."""
 
-FOOT = (
-    "Intervals are 95 % bootstrap intervals over scenarios. Velocity and "
-    "vorticity are per frame; lengths are in units of the box. This page is one file "
-    "and asks nothing of the network."
-)
+FLAG_STATES = {True: "raised", False: "clear", None: "unknown"}
 
 
 @dataclass(frozen=True)
-class Section:
-    """A section of the page."""
+class Tile:
+    """A number at the top of the page."""
 
-    name: str  # identifier, unique on the page
-    title: str  # its heading
-    lead: str  # what stands before the figures: markup, or the text of a paragraph
-    figures: Sequence[ReportFigure] = ()
+    title: str
+    value: str
+    note: str
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A flag or a warning about an entry."""
+
+    entry: str
+    state: str  # raised, clear, unknown or warning
+    name: str
+    message: str
 
 
 def write_report(
@@ -75,8 +76,8 @@ def write_report(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: no score report, score reports that do not belong together, or a
-            page there that is no report.
+        UsageError: no score report, score reports that do not belong together, a page
+            there that is no report, or no matplotlib.
         DataError: the test subset is missing or damaged.
         UnreadableFileError: a predictions.nc is damaged.
         WorkFailedError: the page cannot be written.
@@ -100,196 +101,98 @@ def check_folder(folder: str | Path) -> None:
     """
     check_writable(Path(folder), option="--report")
     path = Path(folder) / FILE_NAME
-    if not path.is_file():
-        return
-    policy_tag = _policy_tag().encode()
-    with path.open("rb") as stream:
-        head = stream.read(4 * len(policy_tag))
-    if policy_tag not in head:
+    if path.is_file() and POLICY not in path.read_text("utf-8", errors="replace"):
         raise UsageError(
-            "the folder holds an index.html that is no report",
+            f"{path} is no report; name another folder, or remove the page",
             where="--report",
-            expected="a folder without index.html, or with a report",
-            got=str(path),
-            fix="name another folder, or remove the page",
         )
-
-
-def _policy_tag() -> Markup:
-    """Return the tag that is in the head of every report, and of no other page."""
-    return tag("meta", http_equiv="Content-Security-Policy", content=POLICY)
 
 
 def render(subject: Subject) -> str:
     """Return the page."""
     gallery = read_gallery(subject)
-    vorticity = _vorticity_section(subject, gallery)
-    motion = _motion_section(subject, gallery)
+    environment = Environment(
+        loader=PackageLoader("lagbench.figures.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    header = subject.entries[0].card.header
+    return environment.get_template("page.html").render(
+        policy=POLICY,
+        subject=subject,
+        header=header,
+        config=subject.task.config,
+        particles=_count_particles(subject),
+        tiles=_make_tiles(subject),
+        sections=_draw_sections(subject, gallery),
+        score_tables=tables.score_tables(subject),
+        metric_tables=tables.metric_tables(subject),
+        notices=_list_notices(subject),
+        files=shlex.join(entry.predictions.name for entry in subject.entries),
+    )
+
+
+def _draw_sections(
+    subject: Subject, gallery: Gallery
+) -> list[tuple[str, list[pictures.Picture]]]:
+    """Return the headings of the page's pictures, and the pictures."""
+    rollout = list(pictures.rollout_pictures(subject))
+    vorticity = list(pictures.distribution_pictures(subject, gallery))
+    energy = list(pictures.energy_pictures(subject))
     if subject.is_full_box:
-        vorticity_and_motion = [vorticity, motion]
+        motion = ("The flow", list(pictures.flow_pictures(subject, gallery)))
     else:
-        vorticity_and_motion = [motion, vorticity]
-    sections = [
-        Section("scores", "Scores", _score_tables(subject)),
-        _rollout_section(subject),
-        *vorticity_and_motion,
-        Section(
-            "energy",
-            "Energy",
-            "Whether the motion is damped, kept or fed.",
-            list(curves.energy_curves(subject)),
-        ),
-        Section("metrics", "Every metric", _metric_tables(subject)),
-        Section("identity", "What was scored", summary.draw_identity(subject)),
+        particles = list(pictures.particle_pictures(subject, gallery))
+        motion = ("Particles", particles + list(pictures.body_pictures(subject)))
+    return [
+        ("Error over the rollout", rollout),
+        motion,
+        ("Vorticity", vorticity),
+        ("Energy", energy),
     ]
-    title = summary.format_title(subject)
-    return compose_page(title, summary.draw_head(subject), sections)
 
 
-def _score_tables(subject: Subject) -> Markup:
-    ranking = subject.ranking.name
-    parts = [
-        paragraph(
-            "Mean over the horizon and the scenarios, 95 % interval below; bold "
-            "is best."
-        ),
-        tables.score_table(subject),
-        tag("h4", f"Ranking by {words(ranking)}"),
-        tables.ranking_table(subject),
-        tag("h4", f"At frame {subject.key_frame}"),
-        tables.frame_table(subject),
-        tag("h4", f"{words(ranking, capital=True)} per scenario"),
-        tables.scenario_table(subject),
-        tag("h4", "Flags and warnings"),
-        summary.draw_flags(subject),
-    ]
-    return join(parts)
+def _count_particles(subject: Subject) -> str:
+    """Return how many particles the scenarios have: a number or a range."""
+    size = subject.task.size
+    counts = {size.particle_count(scenario) for scenario in subject.scenarios}
+    if len(counts) == 1:
+        return str(counts.pop())
+    return f"{min(counts)} to {max(counts)}"
 
 
-def _metric_tables(subject: Subject) -> Markup:
-    lead = paragraph(
-        "Means over the horizon and the scenarios, with 95 % intervals; bold is best."
-    )
-    return join([lead, tables.every_metric(subject)])
+def _make_tiles(subject: Subject) -> list[Tile]:
+    """Return the numbers of the best entry that matter most."""
+    best = subject.best_entry
+    tiles = []
+    if best.entry is not None and best.entry.card.skill is not None:
+        skill = best.entry.card.skill
+        interval = tables.format_interval(skill.interval)
+        note = f"{interval}; 1 − score / score of {skill.reference}"
+        tiles.append(Tile("skill", text(skill.value), note))
+    for name in (subject.ranking.name, *TILES):
+        score = best.scores.get(name)
+        if score is None or any(tile.title == words(name) for tile in tiles):
+            continue
+        note = tables.format_interval(score.interval)
+        tiles.append(Tile(words(name), text(score.mean), note))
+    return tiles
 
 
-def _rollout_section(subject: Subject) -> Section:
-    return Section(
-        "rollout",
-        "Error over the rollout",
-        "How the error grows from frame to frame.",
-        [*curves.method_curves(subject), *curves.error_curves(subject)],
-    )
-
-
-def _vorticity_section(subject: Subject, gallery: Gallery) -> Section:
-    bars = list(distributions.bar_figures(subject))
-    figures = [
-        maps.field_figure(subject, gallery),
-        distributions.histogram_figure(subject, gallery),
-        *bars[:1],
-        distributions.histograms_figure(subject, gallery),
-        *bars[1:],
-        *distributions.residual_figures(subject, gallery),
-    ]
-    return Section(
-        "vorticity",
-        "Vorticity",
-        "Where the flow rotates, how strongly, and how the prediction differs.",
-        figures,
-    )
-
-
-def _motion_section(subject: Subject, gallery: Gallery) -> Section:
-    if subject.is_full_box:
-        return Section(
-            "flow",
-            "The flow over time",
-            "Truth and prediction as fields on the score grid.",
-            [
-                maps.vorticity_figure(subject, gallery),
-                *arrows.arrow_figures(subject, gallery),
-                maps.scenario_figure(subject, gallery),
-            ],
-        )
-    return Section(
-        "particles",
-        "Particles",
-        "What the particles do: truth above, predictions below.",
-        [
-            *particles.particle_figures(subject, gallery),
-            *curves.body_curves(subject),
-        ],
-    )
-
-
-def compose_page(title: str, head: Markup, sections: Sequence[Section]) -> str:
-    """Return an HTML page of sections, with a table of contents."""
-    links = []
-    for section in sections:
-        link = tag("a", section.title, href=f"#part-{section.name}")
-        links.append(tag("li", link))
-    contents = tag("nav", tag("ol", *links), class_="contents", aria_label="Contents")
-
-    parts = []
-    first_number = 1
-    for number, section in enumerate(sections):
-        is_open = number < OPEN_SECTIONS
-        parts.append(_compose_section(section, first_number, is_open=is_open))
-        first_number += len(section.figures)
-
-    meta = [
-        tag("meta", charset="utf-8"),
-        _policy_tag(),
-        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("meta", name="color-scheme", content="light dark"),
-        tag("meta", name="referrer", content="no-referrer"),
-        tag("title", title),
-        tag("link", rel="icon", href="data:,"),
-        tag("style", Markup(load_style_sheet())),
-    ]
-    body = [
-        tag("header", head),
-        tag("div", contents, tag("main", *parts), class_="columns"),
-        tag("footer", paragraph(FOOT)),
-    ]
-    whole = tag("html", tag("head", *meta), tag("body", *body), lang="en")
-    return f"<!DOCTYPE html>\n{whole}\n"
-
-
-def _compose_section(section: Section, first_number: int, *, is_open: bool) -> Markup:
-    """Return a section that its heading folds and unfolds.
-
-    The identifier stands inside: a link to it unfolds the section.
-    """
-    if isinstance(section.lead, Markup):
-        lead = section.lead
-    else:
-        lead = paragraph(section.lead)
-    parts = [lead]
-    figures = []
-    for number, figure in enumerate(section.figures, first_number):
-        figures += [_compose_figure(figure, number), "\n"]
-    if figures:
-        parts.append(tag("div", *figures, class_="figures"))
-    heading = tag("summary", tag("h2", section.title))
-    content = tag("div", *parts, id=f"part-{section.name}")
-    drawn = tag("details", heading, content, class_="part", open=is_open)
-    return join([drawn, "\n"])
-
-
-def _compose_figure(figure: ReportFigure, number: int) -> Markup:
-    label = tag("span", f"Figure {number}", class_="number")
-    source = tag("span", f"thesis {figure.thesis}", class_="thesis")
-    parts = [
-        tag("h3", label, " ", figure.title),
-        figure.body,
-        tag("figcaption", tag("p", figure.caption, " ", source)),
-    ]
-    if figure.data is not None:
-        title = tag("summary", "Numbers")
-        parts.append(tag("details", title, figure.data, class_="numbers"))
-    kind = "figure"
-    if figure.wide:
-        kind = "figure wide"
-    return tag("figure", *parts, id=figure.name, class_=kind)
+def _list_notices(subject: Subject) -> list[Notice]:
+    """Return flags and warnings of every entry."""
+    notices = []
+    for entry in subject.entries:
+        for flag in entry.card.flags:
+            reasons = "; ".join(flag.reasons)
+            state = FLAG_STATES[flag.raised]
+            name = flag.name.replace("_", " ")
+            notices.append(Notice(entry.name, state, name, reasons))
+        for warning in entry.card.warnings:
+            notices.append(Notice(entry.name, "warning", warning.check, str(warning)))
+        for scenario, frame in sorted((entry.card.header.diverged_at or {}).items()):
+            message = f"scenario {scenario} is frozen from frame {frame} on"
+            notices.append(Notice(entry.name, "warning", "diverged", message))
+    return notices

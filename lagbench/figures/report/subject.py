@@ -17,6 +17,7 @@ from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.figures.recording import name_start
+from lagbench.figures.solid import SLICE
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
@@ -26,9 +27,6 @@ from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import Predictions, open_predictions
 
 Floats = NDArray[np.float64]
-
-COLOURS = 6  # series that differ in colour; further ones are dashed
-DASHES = 3
 
 THESIS_FRAMES = {"cavity": 54, "curl-noise": 40}
 """Frame at which the thesis compares models: 54, and 35 after the last of 6 given
@@ -57,18 +55,12 @@ class ReportEntry:
     card: ScoreCard  # its scores
     predictions: Path  # its file
 
-    @property
-    def kind(self) -> str:
-        """Classes of its marks."""
-        return series_kind(self.number)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReportRow:
     """One line of tables and charts: an entry or a reference predictor."""
 
     name: str
-    kind: str  # classes of its marks
     scores: Mapping[str, Score]  # its scores by metric
     entry: ReportEntry | None = None  # None for a reference predictor
 
@@ -83,19 +75,14 @@ class Subject:
 
     @cached_property
     def rows(self) -> tuple[ReportRow, ...]:
-        """Entries, then the reference predictors."""
+        """The reference predictors, then the entries."""
         rows = []
+        for name, scores in self.entries[0].card.scores.items():
+            if name != SUBMISSION:
+                rows.append(ReportRow(name=name, scores=scores))
         for entry in self.entries:
             scores = entry.card.submission
-            row = ReportRow(
-                name=entry.name, kind=entry.kind, scores=scores, entry=entry
-            )
-            rows.append(row)
-        reference_scores = dict(self.entries[0].card.scores)
-        del reference_scores[SUBMISSION]
-        for number, (name, scores) in enumerate(reference_scores.items()):
-            kind = f"reference{number}"
-            rows.append(ReportRow(name=name, kind=kind, scores=scores))
+            rows.append(ReportRow(name=entry.name, scores=scores, entry=entry))
         return tuple(rows)
 
     @property
@@ -121,7 +108,7 @@ class Subject:
     def best_entry(self) -> ReportRow:
         """The entry with the least loss in the ranking metric, the first of equals."""
         metric = self.ranking
-        rows = self.rows[: len(self.entries)]
+        rows = [row for row in self.rows if row.entry is not None]
         losses = []
         for row in rows:
             score = row.scores[metric.name]
@@ -168,18 +155,6 @@ class Subject:
         return tuple(sorted(frames)) or (predicted[-1],)
 
     @property
-    def histogram_frames(self) -> tuple[int, ...]:
-        """Frames of the distributions over time.
-
-        They are those of interest except the key frame, or evenly spaced.
-        """
-        frames = list(self.frames_of_interest)
-        frames.remove(self.key_frame)
-        if len(frames) >= TIMES:
-            return tuple(frames[:TIMES])
-        return self.times
-
-    @property
     def times(self) -> tuple[int, ...]:
         """Frames of the pictures over time, with the first and last predicted one."""
         predicted = self.task.config.predicted_frames
@@ -188,15 +163,6 @@ class Subject:
         else:
             frames = _choose_evenly(predicted, TIMES)
         return tuple(sorted({*frames, predicted[-1]}))
-
-
-def series_kind(number: int) -> str:
-    """Return the classes of a series: six colours, then the same colours dashed."""
-    colour = f"s{number % COLOURS}"
-    dash = min(number // COLOURS, DASHES)
-    if dash == 0:
-        return colour
-    return f"{colour} d{dash}"
 
 
 def _choose_evenly(numbers: Sequence[int], count: int) -> Sequence[int]:
@@ -221,11 +187,7 @@ def load_subject(
     """
     if not cards or len(cards) != len(predictions):
         raise UsageError(
-            "a report needs score reports and their predictions",
-            where="cards and predictions",
-            expected="one file per score report, at least one",
-            got=f"{len(cards)} score reports, {len(predictions)} files",
-            fix="give the file of each score report, in the same order",
+            "a report needs score cards and their predictions; give as many of both"
         )
     _check_same_data(cards, predictions)
     header = cards[0].header
@@ -260,43 +222,9 @@ def _check_same_data(cards: Sequence[ScoreCard], predictions: Sequence[Path]) ->
             expected = expected_fields.setdefault(name, value)
             if value != expected:
                 raise UsageError(
-                    f"one report, two values of {name}",
-                    where=str(path),
-                    expected=expected,
-                    got=value,
-                    fix="report submissions to one data set together, others on "
-                    "their own",
+                    f"{path} has another {name} than the files before it; report "
+                    "submissions to one data set together"
                 )
-
-
-@dataclass(frozen=True)
-class ScenarioLabel:
-    """What sets a scenario apart: moving walls, Reynolds number, family."""
-
-    moving: tuple[str, ...]  # names of the walls that slide
-    reynolds: float | None  # Reynolds number, None where there is none
-    mark: str  # family, pair or start, as in "falling circle", or empty
-    is_slice: bool = False  # whether maps are slices of three dimensions
-    # centre and radius of a fixed obstacle [length]; None without one
-    obstacle: NDArray[np.float32] | None = None
-
-    @property
-    def classes(self) -> str:
-        """Classes of a panel, which tell the walls that move."""
-        classes = "panel"
-        for wall in self.moving:
-            classes += f" {wall}-moves"
-        return classes
-
-    @property
-    def details(self) -> list[str]:
-        """The mark and the Reynolds number, if the scenario has them."""
-        details = []
-        if self.mark:
-            details.append(self.mark)
-        if self.reynolds is not None:
-            details.append(f"Re {self.reynolds:.0f}")
-        return details
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -339,11 +267,18 @@ class Gallery:
     """All frames that the pictures of a report show."""
 
     moments: Mapping[tuple[int, int], Moment]  # by scenario id and frame
-    labels: Mapping[int, ScenarioLabel]  # by scenario id
+    labels: Mapping[int, str]  # what sets a scenario apart, by its id
 
     def at(self, scenario: int, frames: Collection[int]) -> list[Moment]:
         """Return the moments of a scenario at some frames."""
         return [self.moments[scenario, frame] for frame in frames]
+
+    def describe(self, scenario: int) -> str:
+        """Return a sentence that names a scenario and what sets it apart."""
+        label = self.labels[scenario]
+        if not label:
+            return f"Scenario {scenario}."
+        return f"Scenario {scenario}: {label}."
 
 
 def read_gallery(subject: Subject) -> Gallery:
@@ -354,8 +289,8 @@ def read_gallery(subject: Subject) -> Gallery:
         UnreadableFileError: predictions are.
     """
     moments: dict[tuple[int, int], Moment] = {}
-    labels: dict[int, ScenarioLabel] = {}
-    all_frames = {subject.key_frame, *subject.times, *subject.histogram_frames}
+    labels: dict[int, str] = {}
+    all_frames = {subject.key_frame, *subject.times}
     with ExitStack() as stack:
         files = []
         for entry in subject.entries:
@@ -395,36 +330,29 @@ def _read_pairs(
     return tuple(pairs)
 
 
-def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
+def _label_scenario(truth: OpenScenario) -> str:
+    """Return the family, the Reynolds number and the moving walls of a scenario."""
     file = truth.file
     parameters = file.header.parameters
-    moving = []
+    details = []
+    for name in ("family", "pair"):
+        if name in parameters:
+            details.append(str(parameters[name]))
+    start = name_start(parameters)
+    if start:
+        details.append(start)
+    reynolds = parameters.get("reynolds_number")
+    if isinstance(reynolds, (int, float)):
+        details.append(f"Re {reynolds:.0f}")
     if "wall_velocity" in file.variables:
         wall_velocity = np.asarray(file.read("wall_velocity"), np.float64)
         largest = np.abs(wall_velocity).max(axis=0)  # shape [wall, axis]
         for number, velocity in enumerate(largest):
-            along = np.delete(velocity, number // 2)
-            if along.any():
-                moving.append(WALL_NAMES[number])
-
-    marks = []
-    for name in ("family", "pair"):
-        if name in parameters:
-            marks.append(str(parameters[name]))
-    start = name_start(parameters)
-    if start:
-        marks.append(start)
-    reynolds = None
-    value = parameters.get("reynolds_number")
-    if isinstance(value, (int, float)):
-        reynolds = float(value)
-    return ScenarioLabel(
-        moving=tuple(moving),
-        reynolds=reynolds,
-        mark=", ".join(marks),
-        is_slice=truth.scenario.config.box.dimension == 3,
-        obstacle=truth.obstacle,
-    )
+            if np.delete(velocity, number // 2).any():
+                details.append(f"{WALL_NAMES[number]} wall moves")
+    if truth.scenario.config.box.dimension == 3:
+        details.append(f"fields are a slice {SLICE}")
+    return ", ".join(details)
 
 
 def limit_of(fields: Sequence[Floats]) -> float:

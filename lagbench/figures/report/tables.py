@@ -1,40 +1,24 @@
-"""Tables of the report: scores over the horizon, at frames, per scenario, ranked."""
+"""Tables of the report as plain cells; the template draws them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.figures.html import (
-    Markup,
-    draw_table,
-    format_unit,
-    interval,
-    join,
-    paragraph,
-    tag,
-    text,
-    words,
-    wrap_number,
-)
+from lagbench.figures.numbers import format_unit, text, words
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, Metric, mean
-from lagbench.metrics.significance import (
-    FEWEST_SCENARIOS,
-    Comparison,
-    Standing,
-    compare,
-    standings,
-)
+from lagbench.metrics.significance import compare, standings
 from lagbench.metrics.table import CHOSEN, FAMILIES, METRICS
 
-from .subject import ReportRow, Subject
+from .subject import Subject
 
 Floats = NDArray[np.float64]
 
-# metrics of the table at the key frame, in full boxes and with a free surface
 AT_FRAME_FULL_BOX = (
     "vorticity_mae",
     "vorticity_mse",
@@ -42,6 +26,8 @@ AT_FRAME_FULL_BOX = (
     "vorticity_pearson",
     "vorticity_kl",
 )
+"""Metrics of Table 5.4 of the thesis."""
+
 AT_FRAME_FREE_SURFACE = (
     "sliced_w2",
     "position_rmse",
@@ -56,37 +42,55 @@ AIMS = {
     Direction.NONE: "observable",
 }
 
-LINE_BREAK = "\u200b"  # where a line may end
+UNDEFINED = "*"
+"""Behind a mean that leaves out undefined values."""
 
 
-def score_table(subject: Subject) -> Markup:
-    """Return the chosen metrics over the horizon, with intervals, by method."""
+@dataclass(frozen=True)
+class ReportCell:
+    """One cell of a table."""
+
+    text: str
+    note: str = ""  # smaller, below the text
+    is_best: bool = False
+
+
+@dataclass(frozen=True)
+class ReportTable:
+    """One table of the page; the first cell of a row is its heading."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[ReportCell]]
+    note: str = ""
+
+
+def score_tables(subject: Subject) -> list[ReportTable]:
+    """Return the tables of the chosen metrics, the ranking, a frame, the scenarios."""
     names = dict.fromkeys((subject.ranking.name, *CHOSEN))
-    return _horizon_table(subject, _measured(subject, names))
+    return [
+        _horizon_table(subject, "Mean over the horizon", _measured(subject, names)),
+        _ranking_table(subject),
+        _frame_table(subject),
+        _scenario_table(subject),
+    ]
 
 
-def every_metric(subject: Subject) -> Markup:
-    """Return all metrics over the horizon, family by family."""
-    parts = []
+def metric_tables(subject: Subject) -> list[ReportTable]:
+    """Return all metrics over the horizon, a table per family."""
+    tables = []
     for family, metrics in FAMILIES.items():
-        family_names = [metric.name for metric in metrics]
-        names = _measured(subject, family_names)
+        names = _measured(subject, [metric.name for metric in metrics])
         if names:
-            parts.append(tag("h4", family.capitalize()))
-            parts.append(_horizon_table(subject, names))
-
+            tables.append(_horizon_table(subject, family.capitalize(), names))
     submission = subject.entries[0].card.submission
-    names = []
-    for name in submission:
-        if name not in METRICS:
-            names.append(name)
+    names = [name for name in submission if name not in METRICS]
     if names:
-        parts.append(tag("h4", "Of other packages"))
-        parts.append(_horizon_table(subject, names))
-    return join(parts)
+        tables.append(_horizon_table(subject, "Of other packages", names))
+    return tables
 
 
-def _measured(subject: Subject, names: Sequence[str] | dict[str, None]) -> list[str]:
+def _measured(subject: Subject, names: Iterable[str]) -> list[str]:
     """Return the metrics that all entries have, of some names."""
     submissions = [entry.card.submission for entry in subject.entries]
     measured = []
@@ -96,77 +100,61 @@ def _measured(subject: Subject, names: Sequence[str] | dict[str, None]) -> list[
     return measured
 
 
-def _horizon_table(subject: Subject, names: Sequence[str]) -> Markup:
-    """Return means over the horizon, a line per metric and a column per method."""
-    head = ["metric", *map(_draw_heading, subject.rows)]
-    lines = []
+def _horizon_table(subject: Subject, title: str, names: Sequence[str]) -> ReportTable:
+    """Return means over the horizon, a row per metric and a column per method."""
+    rows = []
+    has_undefined = False
     for name in names:
-        metric = subject.rows[0].scores[name].metric
-        # reference predictors lack metrics of other packages
-        scores = []
-        for row in subject.rows:
-            scores.append(row.scores.get(name))
-        values: list[Sequence[float] | Floats] = []
+        scores = [row.scores.get(name) for row in subject.rows]
+        metric = subject.entries[0].card.submission[name].metric
+        values = []
         for score in scores:
-            if score is None:
-                values.append([])
-            else:
-                values.append(score.values)
+            values.append(np.array([]) if score is None else score.values)
         best = _find_best(metric, values)
-
-        ranks = metric.name == subject.ranking.name
-        line: list[object] = [_draw_metric(metric, ranks=ranks)]
+        cells = [_metric_cell(metric)]
         for column, score in enumerate(scores):
-            if score is None:
-                line.append("")
-            else:
-                line.append(_draw_score(score, is_best=column in best))
-        lines.append(line)
-    return draw_table(head, lines, kind="scores", label="Scores")
+            cells.append(_score_cell(score, is_best=column in best))
+            has_undefined |= score is not None and sum(score.undefined) > 0
+        rows.append(cells)
+    note = ""
+    if has_undefined:
+        note = f"{UNDEFINED} Some frames have no value; the mean leaves them out."
+    head = ["metric", *(row.name for row in subject.rows)]
+    return ReportTable(title, head, rows, note)
 
 
-def _draw_metric(metric: Metric, *, ranks: bool) -> Markup:
-    """Return name, unit, summary and aim of a metric."""
-    name = metric.name.replace("_", f"_{LINE_BREAK}")
-    unit = tag("span", format_unit(metric), class_="unit")
-    parts: list[object] = [name, unit]
-    if ranks:
-        badge = tag("span", "ranks", class_="flag ok")
-        parts += [" ", badge]
+def _metric_cell(metric: Metric) -> ReportCell:
+    """Return name and unit of a metric, and what it measures."""
     if metric.direction is Direction.TARGET:
         aim = f"aims at {metric.perfect:g}"
     else:
         aim = AIMS[metric.direction]
-    summary = tag("span", f"{metric.summary}; {aim}", class_="sub")
-    return join([tag("span", *parts, class_="metric"), summary])
+    return ReportCell(f"{metric.name}{format_unit(metric)}", f"{metric.summary}; {aim}")
 
 
-def _draw_score(score: Score, *, is_best: bool) -> Markup:
-    """Return a mean with its interval and the number of undefined values."""
-    parts = [_draw_number(score.mean, is_best=is_best), interval(score.interval)]
-    undefined_count = sum(score.undefined)
-    if undefined_count:
-        note = f"{undefined_count} undefined"
-        parts.append(tag("span", note, class_="ci"))
-    return join(parts)
+def _score_cell(score: Score | None, *, is_best: bool) -> ReportCell:
+    """Return a mean with its interval."""
+    if score is None:
+        return ReportCell("")
+    shown = text(score.mean)
+    if sum(score.undefined):
+        shown += UNDEFINED
+    return ReportCell(shown, format_interval(score.interval), is_best)
 
 
-def _draw_number(value: float, *, is_best: bool) -> Markup:
-    kind = "n"
-    if is_best:
-        kind = "n best"
-    return tag("span", text(value), class_=kind)
+def format_interval(bounds: tuple[float, float]) -> str:
+    """Return an interval; nothing where there is none.
+
+    >>> format_interval((0.25, 1.0)), format_interval((math.nan, math.nan))
+    ('0.250 … 1', '')
+    """
+    low, high = bounds
+    if math.isnan(low) or math.isnan(high):
+        return ""
+    return f"{text(low)} … {text(high)}"
 
 
-def _draw_heading(row: ReportRow) -> Markup:
-    if row.entry is None:
-        return tag("span", row.name, class_="muted whole")
-    return tag("span", row.name)
-
-
-def _find_best(
-    metric: Metric, values: Sequence[Sequence[float] | Floats]
-) -> frozenset[int]:
+def _find_best(metric: Metric, values: Sequence[Floats]) -> frozenset[int]:
     """Return which methods are best by the mean of their scenarios' losses.
 
     Losses that read the same are equal. An observable, or a metric that nobody has, has
@@ -184,92 +172,69 @@ def _find_best(
     return frozenset(i for i, loss in enumerate(losses) if text(loss) == least)
 
 
-def frame_table(subject: Subject) -> Markup:
+def _frame_table(subject: Subject) -> ReportTable:
     """Return the metrics of Tables 5.4 and 5.5 at the key frame, by method."""
-    names = _measured(subject, AT_FRAME_FREE_SURFACE)
-    if subject.is_full_box:
-        names = _measured(subject, AT_FRAME_FULL_BOX)
     frame = subject.key_frame
-    lines: list[list[object]] = []
+    wanted = AT_FRAME_FREE_SURFACE
+    if subject.is_full_box:
+        wanted = AT_FRAME_FULL_BOX
+    names = _measured(subject, wanted)
+    rows = []
     for row in subject.rows:
-        lines.append([_draw_heading(row)])
-    for name in names:
-        metric = subject.rows[0].scores[name].metric
-        values = []
-        for row in subject.rows:
-            values.append(row.scores[name].at(frame))
-        comparable = _comparable(subject, metric, values)
-        best = _find_best(metric, comparable)
-        for number, line in enumerate(lines):
-            value = mean(values[number])
-            line.append(_draw_number(value, is_best=number in best))
-    head = ["method", *map(words, names)]
-    return draw_table(head, lines, label=f"Scores at frame {frame}")
+        cells = [ReportCell(row.name)]
+        for name in names:
+            score = row.scores.get(name)
+            cells.append(
+                ReportCell("" if score is None else text(mean(score.at(frame))))
+            )
+        rows.append(cells)
+    head = ["method", *(words(name) for name in names)]
+    return ReportTable(f"At frame {frame}", head, rows)
 
 
-def _comparable(
-    subject: Subject, metric: Metric, values: Sequence[Floats]
-) -> list[Floats]:
-    """Return values by method, none for means that cannot be compared.
-
-    Of reference predictors only the mean is known. It says nothing about a metric with
-    a target: scenarios on both sides of the target cancel.
-    """
-    if metric.direction is not Direction.TARGET:
-        return list(values)
-    comparable = []
-    for method_values in values:
-        has_all_scenarios = len(method_values) >= len(subject.scenarios)
-        if has_all_scenarios:
-            comparable.append(method_values)
-        else:
-            comparable.append(method_values[:0])
-    return comparable
-
-
-def scenario_table(subject: Subject) -> Markup:
+def _scenario_table(subject: Subject) -> ReportTable:
     """Return the ranking metric of every scenario, by method."""
-    name = subject.ranking.name
-    lines = []
+    metric = subject.ranking
+    rows = []
     for row in subject.rows:
-        values = row.scores[name].values.tolist()
-        lines.append([_draw_heading(row), *map(wrap_number, values)])
-    head = ["method", *map(str, subject.scenarios)]
-    return draw_table(head, lines, label=f"{name} per scenario")
+        values = row.scores[metric.name].values.tolist()
+        rows.append(
+            [ReportCell(row.name), *(ReportCell(text(value)) for value in values)]
+        )
+    title = f"{words(metric.name, capital=True)} per scenario"
+    return ReportTable(title, ["method", *map(str, subject.scenarios)], rows)
 
 
-def ranking_table(subject: Subject) -> Markup:
-    """Return the ranking of entries, each tested against the best entry.
+def _ranking_table(subject: Subject) -> ReportTable:
+    """Return every method beside the best entry; only entries have a rank.
 
-    Tests are sign-flip tests, corrected by Holm. Reference predictors follow, unranked.
-    A reference predictor may be better than the best entry.
+    Tests are sign-flip tests, corrected by Holm.
     """
     name = subject.ranking.name
-    entries = {}
     scores = {}
     for row in subject.rows:
         if row.entry is not None:
-            entries[row.name] = row
             scores[row.name] = row.scores[name]
     ranked = standings(scores)
     best_entry = next(iter(ranked))
     best_score = scores[best_entry]
-
-    lines: list[list[object]] = []
-    for method, standing in ranked.items():
-        row = entries[method]
-        score = row.scores[name]
-        comparison = compare(score, best_score)
-        cells = _draw_standing(standing, comparison)
-        rank = str(standing.rank)
-        lines.append([_draw_heading(row), rank, wrap_number(score.mean), *cells])
+    rows = []
     for row in subject.rows:
-        if row.entry is None:
-            score = row.scores[name]
+        score = row.scores[name]
+        if row.name == best_entry and row.entry is not None:
+            cells = [row.name, "1", text(score.mean), "", "", ""]
+        else:
             comparison = compare(score, best_score)
-            cells = _draw_difference(comparison)
-            mean_cell = wrap_number(score.mean)
-            lines.append([_draw_heading(row), "", mean_cell, *cells, "", ""])
+            difference = text(comparison.difference)
+            interval = format_interval(comparison.interval)
+            if row.entry is None:
+                cells = [row.name, "", text(score.mean), difference, interval, ""]
+            else:
+                standing = ranked[row.name]
+                rank = str(standing.rank)
+                p = text(standing.p)
+                cells = [row.name, rank, text(score.mean), difference, interval, p]
+        rows.append([ReportCell(cell) for cell in cells])
     head = [
         "method",
         "rank",
@@ -277,39 +242,10 @@ def ranking_table(subject: Subject) -> Markup:
         "loss − loss of the best submission",
         "95 % interval",
         "p",
-        "differs from the best submission",
     ]
-    lead = paragraph(
-        "Only submissions have a rank. Reference predictors stand below them for "
-        "comparison. A method with a negative difference of the losses is better than "
-        "the best submission."
-    )
-    note = tag("small", _explain_test(subject), class_="muted")
-    table = draw_table(head, lines, label="Comparison")
-    return join([lead, table, paragraph(note)])
-
-
-def _draw_difference(comparison: Comparison) -> list[object]:
-    return [wrap_number(comparison.difference), interval(comparison.interval)]
-
-
-def _draw_standing(standing: Standing, comparison: Comparison) -> list[object]:
-    """Return difference from the best entry, interval, p, and whether they differ."""
-    if standing.rank == 1:
-        return [tag("span", "best submission", class_="muted"), "", "", ""]
-    verdict: object = "yes"
-    if standing.tied:
-        verdict = tag("span", "no", class_="muted")
-    return [*_draw_difference(comparison), wrap_number(standing.p), verdict]
-
-
-def _explain_test(subject: Subject) -> str:
-    count = len(subject.scenarios)
     note = (
-        f"p: exact two-sided sign-flip test over {count} scenarios, corrected by Holm "
-        "for the comparisons with the best submission. It is about these weights: "
-        "other seeds may stand otherwise."
+        f"p: exact two-sided sign-flip test over {len(subject.scenarios)} scenarios, "
+        "corrected by Holm. It is about these weights: other seeds may stand otherwise."
     )
-    if count < FEWEST_SCENARIOS:
-        note += f" Under {FEWEST_SCENARIOS} scenarios nothing is claimed."
-    return note
+    title = f"Ranking by {words(name)}"
+    return ReportTable(title, head, rows, note)
