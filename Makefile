@@ -34,12 +34,12 @@ $(BIN)/python:
 
 $(VENV)/.demo: $(BIN)/python pyproject.toml constraints.txt
 	@echo 'installing into $(VENV): about 1 GB, some minutes'
-	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[generate,plots,baselines]' --config-settings editable_mode=compat
+	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[generate,plots,baselines]'
 	touch $@
 
 $(VENV)/.dev: $(BIN)/python pyproject.toml constraints.txt
 	@echo 'installing into $(VENV): more than 1 GB, some minutes'
-	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev]' --config-settings editable_mode=compat
+	$(PIP) install --quiet --no-compile -c constraints.txt -e '.[dev]'
 	touch $@ $(VENV)/.demo
 
 clean:

@@ -29,7 +29,7 @@ PACKAGE = Path(lagbench.__file__).parent
 STUDIES = PACKAGE.parent / "studies"
 
 LAYERS = (
-    ("addresses", "arguments", "errors", "atomic"),
+    ("addresses", "errors", "atomic"),
     ("work",),
     ("data",),
     ("store",),
