@@ -16,13 +16,7 @@ from itertools import compress
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidatorFunctionWrapHandler,
-    field_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from lagbench.data.box import AXES, Box, parse_periodic
@@ -42,47 +36,10 @@ __all__ = [
 ]
 
 
-LARGEST_OPTION = 1e12
-"""Greatest number that an option of counts, steps or epochs may have."""
-
-
 class Settings(BaseModel):
-    """Base of the options that recipes and ``--set`` fill.
-
-    They are frozen. Unknown keys, yes or no for a number, and numbers so large that no
-    machine could work on them, are errors.
-    """
+    """Base of the options that recipes and ``--set`` fill; unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-    @field_validator("*", mode="wrap")
-    @classmethod
-    def _refuse_boolean_numbers(
-        cls, value: object, handler: ValidatorFunctionWrapHandler
-    ) -> object:
-        parsed: object = handler(value)
-        if _has_boolean_number(value, parsed):
-            raise ValueError("a number, not yes or no")
-        if isinstance(parsed, int) and abs(parsed) > LARGEST_OPTION:
-            raise ValueError(f"a whole number up to {LARGEST_OPTION:g}")
-        return parsed
-
-
-def _has_boolean_number(value: object, parsed: object) -> bool:
-    """Return whether a yes or no became 1 or 0 anywhere in a parsed value."""
-    if isinstance(value, bool):
-        return isinstance(parsed, int | float) and not isinstance(parsed, bool)
-
-    if isinstance(value, Mapping) and isinstance(parsed, Mapping):
-        for name, part in value.items():
-            parsed_part = parsed.get(name)
-            if _has_boolean_number(part, parsed_part):
-                return True
-    elif isinstance(value, list | tuple) and isinstance(parsed, list | tuple):
-        for part, parsed_part in zip(value, parsed, strict=False):
-            if _has_boolean_number(part, parsed_part):
-                return True
-    return False
 
 
 class Options(Settings):

@@ -36,9 +36,7 @@ from .checkpoint import Checkpoint, check_data, load, restore
 from .dataset_info import find_forcing
 from .graph import radius_graph
 from .machine import (
-    bound_memory,
     choose_device,
-    explain_memory_errors,
     hardware,
     read_load,
     use_threads,
@@ -52,14 +50,8 @@ from .rollout import (
     scenario_batch,
     scenario_paths,
 )
-from .run_folder import RunFolder
-from .start import warn_of_last_state
 
 TIMED_SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
-
-
-class UnfinishedWarning(UserWarning):
-    """The weights are those of a training that is not over."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,10 +111,6 @@ def predict(
     distance of particles; a radius among the options stays. Statistics stay those of
     the training.
 
-    An :class:`UnfinishedWarning` tells of a training.json beside the checkpoint whose
-    training is not over, a :class:`~lagbench.baselines.start.LastStateWarning` of a
-    checkpoint with the last state beside the best weights.
-
     Args:
         checkpoint: weights.safetensors or checkpoint.safetensors of a training.
         output: file to write; ``<name>.json`` beside it says what it cost.
@@ -164,8 +152,6 @@ def predict(
     trained = load(checkpoint_path)
     output_path = expand_home(output, "--output")
     check_outputs(output_path, overwrite=overwrite)
-    warn_of_last_state(trained, checkpoint_path)
-    _warn_of_unfinished(trained, checkpoint_path)
     root_folder = _find_root(split, trained, root, registry)
     known_splits = load_rooted_registry(root_folder, registry)
     where = str(checkpoint_path)
@@ -174,9 +160,8 @@ def predict(
     )
     paths = _find_scenarios(info, subset, root_folder, known_splits)
     machine = choose_device(device)
-    bound_memory()
 
-    with use_threads(threads), explain_memory_errors("lower --batch"):
+    with use_threads(threads):
         model = restore_for_size(
             trained, info, settings, known_splits, root=root_folder, where=where
         )
@@ -326,24 +311,6 @@ def _write_rollouts(
         if solver_seconds_per_frame is not None:
             writer.label(solver_seconds_per_frame=solver_seconds_per_frame)
     return solver_seconds_per_frame
-
-
-def _warn_of_unfinished(checkpoint: Checkpoint, path: Path) -> None:
-    """Warn of weights whose training is not over.
-
-    The log in the weights of the best validation always says 'running'; the log beside
-    them tells the state of today.
-    """
-    folder = RunFolder(path.parent)
-    reached = folder.unfinished_steps(checkpoint.training)
-    if reached is None:
-        return
-    step, steps = reached
-    message = (
-        f"the training behind {path} stands at step {step} of {steps}; to go on with "
-        f"it give its `lagbench train` command again, with --output {path.parent}"
-    )
-    warnings.warn(message, UnfinishedWarning, stacklevel=3)
 
 
 def _check_batch(batch: int | None) -> None:

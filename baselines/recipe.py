@@ -35,13 +35,12 @@ from pydantic import (
     model_validator,
 )
 
-from lagbench.data.field_errors import describe_expectation
 from lagbench.data.layout import expand_home
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, suggest_name
+from lagbench.errors import UnreadableFileError, UsageError
 
-from .baseline import LARGEST_OPTION, Settings
-from .catalogue import CatalogueEntry, list_names
+from .baseline import Settings
+from .catalogue import CatalogueEntry
 
 
 class Schedule(Settings):
@@ -107,9 +106,7 @@ class TrainingOptions(Settings):
 
     steps: int | None = Field(default=None, gt=0)  # optimiser steps; or give 'epochs'
     # passes over all windows
-    epochs: float | None = Field(
-        default=None, gt=0, le=LARGEST_OPTION, allow_inf_nan=False
-    )
+    epochs: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     batch: int = Field(default=2, gt=0)  # windows of a step, in every process
     # of Adam, times the number of processes (thesis section 5.7.3)
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
@@ -124,9 +121,8 @@ class TrainingOptions(Settings):
     ema: float = Field(default=0.0, ge=0.0, lt=1.0)
     # largest norm of the gradient; None clips nothing
     clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    # 'bf16' runs matrix products in bfloat16, weights stay float32; 'auto' does so
-    # where the hardware multiplies in it
-    precision: Literal["float32", "bf16", "auto"] = "float32"
+    # 'bf16' runs matrix products in bfloat16; weights stay float32
+    precision: Literal["float32", "bf16"] = "float32"
     # fuse the operations of a graph network's processor layers by torch.compile; needs
     # a C++ compiler on CPUs
     compile: bool = False
@@ -145,7 +141,7 @@ class TrainingOptions(Settings):
     patience: int | None = Field(default=None, gt=0)
     # steps between checkpoints; a twentieth of all by default
     checkpoint_every: int | None = Field(default=None, gt=0)
-    log_every: int = Field(default=10, gt=0)  # steps between entries in TensorBoard
+    log_every: int = Field(default=10, gt=0)  # steps between rows of losses.csv
     # seed of weights, order of windows, and noise
     seed: int = Field(default=0, ge=0, lt=2**63)
 
@@ -212,51 +208,6 @@ class TrainingOptions(Settings):
         return step >= steps or step % self.validate_every == 0
 
 
-FITTED_OPTIONS = (
-    "windows",
-    "validate_every",
-    "validation_frames",
-    "validation_scenarios",
-    "seed",
-)
-"""Options of the training that a closed form uses: it is fitted, and takes no steps."""
-
-REFUSED_BY_FIT = ("compile", "ema")
-"""Options that the fit of a closed form refuses where they are on."""
-
-LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
-    "training": {
-        "compile": False,
-        "ema": 0.0,
-        "opening_share": 0.0,
-        "opening_frames": 40,
-    },
-    "model": {
-        "pushforward": 0,
-        "recovery": None,
-        "strain": False,
-        "mixture": False,
-        "average": False,
-        "conserve": False,
-        "shape": [],
-        "density": [],
-        "neighbours": None,
-        "viscosity": False,
-        "shift": False,
-        "body_force": False,
-        "obstacle": False,
-        "noise_spread": False,
-        "compression": 0.0,
-        "free_flight": None,
-        "relaxation": 0,
-        "densest": 1.1,
-    },
-}
-"""Options that the logs of earlier trainings lack, with the values of that time.
-
-With them such trainings can go on.
-"""
-
 Layer = dict[str, Any]
 ANY = "*"
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
@@ -270,33 +221,23 @@ class Recipe:
     name: str  # name of the recipe, as in cavity/mini
     model: Mapping[str, Any]  # options of the model, plain values
     training: TrainingOptions  # options of the training
+    settings: tuple[str, ...] = ()  # changes of the named recipe, as in --set
     # log of the weights that the training starts from, their SHA-256 among it; None for
     # random ones
     start: Mapping[str, Any] | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values."""
-        values = {
+        values: dict[str, Any] = {
             "baseline": self.baseline,
             "name": self.name,
-            "model": _drop_later_defaults("model", self.model),
-            "training": _drop_later_defaults(
-                "training", self.training.model_dump(mode="json")
-            ),
+            "model": dict(self.model),
+            "training": self.training.model_dump(mode="json"),
+            "settings": list(self.settings),
         }
         if self.start:
             values["start"] = dict(self.start)
         return values
-
-
-def _drop_later_defaults(group: str, options: Mapping[str, Any]) -> Layer:
-    """Return options without those that earlier logs lack, where they are as then."""
-    later = LATER_OPTIONS[group]
-    stated = {}
-    for name, value in options.items():
-        if name not in later or later[name] != value:
-            stated[name] = value
-    return stated
 
 
 class _Part(Settings):
@@ -370,156 +311,35 @@ def recipe_for(
         size_name = f"{size}-{variant}"
     name = f"{split}/{size_name}"
     part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{size_name}")
+    if part is None and (file.recipes or variant):
+        raise UsageError(
+            f"{entry.name} has no recipe {name!r}, but of {', '.join(file.recipes)}; "
+            "write your own, --recipe FILE.yaml: docs/baselines.md"
+        )
     if part is None:
-        if file.recipes or variant:
-            is_own_file = file.recipes and path == entry.recipes
-            if is_own_file and not _has_recipes_of(split, size, file):
-                raise _no_recipe_of_split(entry, f"{split}/{size}", file)
-            raise _missing_recipe(entry, name, variant, file)
         part = _SharedRecipe()
-    _check_baselines(part, where=f"{path}, {name}, baselines")
 
     layers: Layer = {"model": file.model, "training": file.training}
     baseline_part = part.baselines.get(entry.name, _Part())
-    learned_part = _Part(model=dict(learned or {}))
-    for above in (part, baseline_part, learned_part):
-        upper_layers = {"model": above.model, "training": above.training}
-        layers = _merge(layers, upper_layers)
-    where = f"{entry.name}, {name}"
-    if path:
-        where = f"{path.name}, {name}"
+    for above in (part, baseline_part):
+        layers = _merge(layers, {"model": above.model, "training": above.training})
+    layers = _merge(layers, {"model": dict(learned or {})})
     settings = tuple(settings)
-    if settings:
-        where += ", and --set"
     for setting in settings:
-        change = _parse_setting(setting)
-        if entry.model.closed_form:
-            _refuse_unused(entry, change, setting)
-        layers = _merge(layers, change)
+        layers = _merge(layers, _parse_setting(setting))
     if seed is not None:
         layers["training"]["seed"] = seed
 
-    model = validate_options(entry.model.Options, layers["model"], "model", where)
-    training = validate_options(TrainingOptions, layers["training"], "training", where)
+    where = f"{entry.name}, {name}"
+    model = _check(entry.model.Options, layers["model"], f"{where}, model")
+    training = _check(TrainingOptions, layers["training"], f"{where}, training")
     return Recipe(
         baseline=entry.name,
         name=name,
         model=model.model_dump(mode="json"),
         training=training,
+        settings=settings,
     )
-
-
-def _has_recipes_of(split: str, size: str, file: _RecipeFile) -> bool:
-    """Return whether a file has a recipe of a split, or one of this size for all."""
-    return split in _splits_of(file) or f"{ANY}/{size}" in file.recipes
-
-
-def _splits_of(file: _RecipeFile) -> set[str]:
-    """Return the splits that a file has recipes of."""
-    splits = set()
-    for recipe in file.recipes:
-        split, _, _ = recipe.partition("/")
-        splits.add(split)
-    return splits
-
-
-def _no_recipe_of_split(
-    entry: CatalogueEntry, name: str, file: _RecipeFile
-) -> UsageError:
-    """Return the error of a split that a baseline knows nothing of, as a user's own."""
-    splits = sorted(_splits_of(file))
-    changes = "{training: {steps: 2000}}"
-    if entry.model.closed_form:
-        changes = "{}"
-    example = f"{{format: 1, recipes: {{{name}: {changes}}}}}"
-    return UsageError(
-        f"{entry.name} has no recipe {name!r}",
-        where="--recipe",
-        expected=f"a YAML file with a recipe of {name}",
-        got=f"recipes of {', '.join(splits) or 'no split'}",
-        fix=f"write a file, as in {example}, and add --recipe FILE.yaml; "
-        f"docs/exchange.md says more",
-    )
-
-
-def _missing_recipe(
-    entry: CatalogueEntry, name: str, variant: str | None, file: _RecipeFile
-) -> UsageError:
-    """Return the error of a recipe that a file does not hold."""
-    split, _, size_name = name.partition("/")
-    if variant:
-        size = size_name.removesuffix(f"-{variant}")
-        ways_out = _suggest_variants(size, variant, split, file)
-    else:
-        ways_out = [_suggest_recipe(name, split, file)]
-    ways_out.append("write your own: --recipe FILE.yaml, see docs/baselines.md")
-    return UsageError(
-        f"{entry.name} has no recipe {name!r}",
-        where="--split, --size, --recipe",
-        expected="a recipe of the split and size",
-        got=ascii(name),
-        fix="; or ".join(ways_out),
-    )
-
-
-def _suggest_recipe(name: str, split: str, file: _RecipeFile) -> str:
-    """Return the nearest recipe, of the same split if it has any."""
-    if not file.recipes:
-        return "leave --recipe out"
-    same_split = [other for other in file.recipes if other.startswith(f"{split}/")]
-    return suggest_name(name, same_split or file.recipes)
-
-
-def _suggest_variants(
-    size: str, variant: str, split: str, file: _RecipeFile
-) -> list[str]:
-    """Return the nearest variant of the size, or the sizes that have this variant.
-
-    Where the size has a recipe of its own, that is the second way out.
-    """
-    size_names = []
-    for recipe in file.recipes:
-        recipe_split, _, size_name = recipe.partition("/")
-        if recipe_split in (split, ANY):
-            size_names.append(size_name)
-    variants = []
-    sizes = []
-    # A split may have a recipe that all splits have too.
-    for size_name in dict.fromkeys(size_names):
-        if size_name.startswith(f"{size}-"):
-            variants.append(size_name.removeprefix(f"{size}-"))
-        if size_name.endswith(f"-{variant}"):
-            other_size = size_name.removesuffix(f"-{variant}")
-            # Variants may have hyphens: mini-long-short is one of mini, unless there is
-            # a size mini-long.
-            if "-" not in other_size or other_size in size_names:
-                sizes.append(other_size)
-
-    has_size = size in size_names
-    ways_out = []
-    if has_size and sizes:
-        ways_out.append(f"--size {' or '.join(sizes)} has it")
-    elif variants:
-        ways_out.append(suggest_name(variant, variants))
-    elif not has_size:
-        ways_out.append(_suggest_recipe(f"{split}/{size}-{variant}", split, file))
-    if has_size:
-        ways_out.append(f"leave --recipe out, for that of {size}")
-    return ways_out
-
-
-def _check_baselines(part: _SharedRecipe, *, where: str) -> None:
-    """Refuse a recipe with a part for an unknown baseline."""
-    names = list_names()
-    for name in part.baselines:
-        if name not in names:
-            raise UnreadableFileError(
-                f"unknown baseline {name!r}",
-                where=where,
-                expected="the name of a reference model",
-                got=ascii(name),
-                fix=suggest_name(name, names),
-            )
 
 
 def change_options(
@@ -532,72 +352,28 @@ def change_options(
     Raises:
         UsageError: an option is unknown, or only a training can change it.
     """
-    layers: Layer = {"model": dict(options)}
+    layers: Layer = {"model": dict(options), "training": {}}
     for setting in settings:
         layers = _merge(layers, _parse_setting(setting))
-        if "training" in layers:
-            raise UsageError(
-                "an option of the training cannot change now",
-                where="--set",
-                expected="an option of the model",
-                got=setting,
-                fix="set options of the model: --set model.KEY=VALUE",
-            )
-    model_options = entry.model.Options
-    before = validate_options(model_options, dict(options), "model", "--set")
-    after = validate_options(model_options, layers["model"], "model", "--set")
-    before_values = before.model_dump(mode="json")
-    after_values = after.model_dump(mode="json")
-    _check_unchanged("training", model_options.in_training, before_values, after_values)
-    _check_unchanged("weights", model_options.of_weights, before_values, after_values)
-    return after_values
-
-
-def _check_unchanged(
-    kind: str, names: Iterable[str], before: Layer, after: Layer
-) -> None:
-    """Refuse changes of options that only a training can change."""
-    changed = []
-    for name in sorted(names):
-        if before[name] != after[name]:
-            changed.append(name)
-    if not changed:
-        return
-    raise UsageError(
-        f"an option of the {kind}",
-        where="--set",
-        expected=", ".join(f"model.{name}={before[name]}" for name in changed),
-        got=", ".join(f"model.{name}={after[name]}" for name in changed),
-        fix="leave it out, or train with it; docs/baselines.md says which options a "
-        "trained model takes",
+    before = _check(entry.model.Options, dict(options), "--set").model_dump(mode="json")
+    after = _check(entry.model.Options, layers["model"], "--set").model_dump(
+        mode="json"
     )
-
-
-def _refuse_unused(entry: CatalogueEntry, change: Layer, setting: str) -> None:
-    """Refuse a known option of the training that a closed form does not use."""
-    known_names = (*FITTED_OPTIONS, *REFUSED_BY_FIT)
-    for name in change.get("training", {}):
-        if name in known_names or name not in TrainingOptions.model_fields:
-            continue
-        used = [f"training.{known}" for known in FITTED_OPTIONS]
+    fixed = entry.model.Options.in_training | entry.model.Options.of_weights
+    changed = [f"model.{name}" for name in sorted(fixed) if before[name] != after[name]]
+    changed += [f"training.{name}" for name in layers["training"]]
+    if changed:
         raise UsageError(
-            f"{entry.name} does not use training.{name}: it is fitted, without steps",
-            where="--set",
-            expected=f"an option of the model, or {', '.join(used)}",
-            got=setting,
-            fix="leave it out; docs/baselines.md says which options of the model bound "
-            "the fit",
+            f"{', '.join(changed)} cannot change after the training", where="--set"
         )
+    return after
 
 
 def _read_file(path: Path) -> _RecipeFile:
-    return validate_options(
-        _RecipeFile,
-        read_yaml(path),
-        "",
-        str(path),
-        error_class=UnreadableFileError,
-    )
+    try:
+        return _RecipeFile.model_validate(read_yaml(path))
+    except ValidationError as error:
+        raise UnreadableFileError(_describe(error), where=str(path)) from None
 
 
 def _merge(below: Layer, above: Layer) -> Layer:
@@ -619,103 +395,41 @@ def _merge(below: Layer, above: Layer) -> Layer:
 
 
 def _parse_setting(text: str) -> Layer:
-    """Return the change by a text such as ``training.schedule.every=100``."""
+    """Return the change by a text such as ``training.schedule.every=100``.
+
+    >>> _parse_setting("training.schedule.every=100")
+    {'training': {'schedule': {'every': 100}}}
+    """
     key, equals, value_text = text.partition("=")
     group, *path = key.strip().split(".")
-    groups = ("model", "training")
-    if not equals or not path or group not in groups:
-        hint = "name group, key and value, as in --set training.steps=100"
-        if path and group in groups:
-            hint = f"name its value: --set {text}=VALUE"
-        if equals and path:
-            hint = suggest_name(group, groups)
-        elif equals:
-            hint = f"name its group: --set training.{text}, or --set model.{text}"
+    if not equals or not path or group not in ("model", "training"):
         raise UsageError(
-            "cannot understand the setting",
+            f"{text!r} is no setting; write model.KEY=VALUE or training.KEY=VALUE",
             where="--set",
-            expected="model.KEY=VALUE or training.KEY=VALUE",
-            got=text,
-            fix=hint,
         )
     try:
         layer: Any = yaml.safe_load(value_text)
-    # PyYAML raises other types too, as for numbers of thousands of digits.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise UsageError(
-            "the value is no YAML",
-            where=f"--set {key}",
-            expected="a value as in YAML: a number, true, a word, [1, 2]",
-            got=" ".join(str(error).split()),
-            fix="put the value in quotes: --set 'KEY=VALUE'",
-        ) from None
+    except yaml.YAMLError:
+        raise UsageError(f"the value of {text!r} is no YAML", where="--set") from None
     for name in reversed((group, *path)):
         layer = {name: layer}
     return dict(layer)
 
 
-def validate_options(
-    options: type[OptionsT],
-    values: object,
-    group: str,
-    where: str,
-    *,
-    error_class: type[LagbenchError] = UsageError,
-) -> OptionsT:
-    """Return checked options; raise the first error that pydantic reports."""
+def _check(options: type[OptionsT], values: Layer, where: str) -> OptionsT:
+    """Return checked options.
+
+    Raises:
+        UsageError: an option is unknown, or its value does not fit.
+    """
     try:
         return options.model_validate(values)
     except ValidationError as error:
-        detail = error.errors()[0]
-    location = detail["loc"]
-    path = [str(part) for part in (group, *location) if part != ""]
-    key = ".".join(path) or "the file"
-    if detail["type"] == "extra_forbidden":
-        *parents, unknown_key = location
-        known_keys = _known_keys(options, parents)
-        prefix = "".join(f"{part}." for part in path[:-1])
-        raise error_class(
-            f"unknown key {key!r}",
-            where=where,
-            expected="a key of a recipe",
-            got=repr(key),
-            fix=suggest_name(str(unknown_key), known_keys, prefix=prefix),
-        )
-
-    if detail["type"] == "missing":
-        raise error_class(
-            f"{key} is missing",
-            where=where,
-            expected=f"the key {key}",
-            got="no such key",
-            fix="add it; docs/baselines.md has the keys and their values, and a file "
-            "of recipes begins with the line format: 1",
-        )
-
-    value = detail["input"]
-    got = repr(value)
-    is_type_error = detail["type"].endswith("_type")
-    if isinstance(value, Mapping) and not is_type_error:
-        got = ", ".join(map(str, value))  # the mapping as a whole
-    raise error_class(
-        f"{key} does not fit",
-        where=where,
-        expected=describe_expectation(detail),
-        got=got[:80],
-        fix="give another value; docs/baselines.md has the keys and their values",
-    )
+        raise UsageError(_describe(error), where=where) from None
 
 
-def _known_keys(options: type[BaseModel], path: Iterable[int | str]) -> list[str]:
-    """Return the keys of the options below a path."""
-    holder = options
-    for step in path:
-        field = holder.model_fields.get(str(step))
-        inner = None
-        if field:
-            inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            holder = inner
-        elif step == "recipes" or holder is _RecipeFile:
-            holder = _SharedRecipe
-    return list(holder.model_fields)
+def _describe(error: ValidationError) -> str:
+    """Return the first thing that pydantic finds wrong."""
+    detail = error.errors()[0]
+    key = ".".join(map(str, detail["loc"]))
+    return f"{key} = {detail['input']!r}: {detail['msg']}"

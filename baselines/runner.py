@@ -17,7 +17,7 @@ from lagbench.data.registry import Registry
 
 from .baseline import Baseline, DatasetInfo
 from .checkpoint import check_data, load
-from .machine import bound_memory, explain_memory_errors, use_threads
+from .machine import use_threads
 from .predict import restore_for_size
 from .rollout import Rollout, count_predicted, roll_out, scenario_batch
 
@@ -56,7 +56,6 @@ class WeightsRunner:
         )
         # of scenarios whose files state none [length^2/s]
         self._viscosity = registry.size(self._info.split, self._info.size).viscosity()
-        bound_memory()
         self._model: Baseline = restore_for_size(
             trained, self._info, settings, registry, root=root, where=str(path)
         )
@@ -85,7 +84,7 @@ class WeightsRunner:
             slice(0, self._info.input_frames),
             viscosity=self._viscosity,
         )
-        with use_threads(self._threads), explain_memory_errors("use more memory"):
+        with use_threads(self._threads):
             return roll_out(self._model, given_frames, frames)[0]
 
     def time(self, scenario_file: Path, frames: int) -> float:

@@ -3,67 +3,74 @@
 Most baselines take steps over windows; models with a closed form are fitted to whole
 scenarios instead. A step draws its windows and its noise from (seed, step, process)
 alone. So a training that was interrupted and resumed ends, on one thread, with the bits
-of an uninterrupted one.
+of an uninterrupted one. An interrupt lets the running step end and stores the state; a
+second one stops at once.
+
+``torchrun --nproc-per-node N -m lagbench train ...`` starts several processes, which
+average their gradients (DDP).
 """
 
 from __future__ import annotations
 
+import csv
 import functools
+import json
+import math
 import os
+import platform
+import signal
+import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
+import torch
+import torch.distributed
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader, Sampler
 
-from lagbench.atomic import check_writable
+from lagbench.atomic import check_writable, write_atomically
+from lagbench.data.checksums import round_digits
 from lagbench.data.layout import expand_home
 from lagbench.data.local import check_contents, locate
-from lagbench.data.registry import Registry, Size
-from lagbench.errors import UsageError
-from lagbench.submission.budget import Track, track_of
-from lagbench.tensors import Batch, TensorWindow, collate
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError, UsageError
+from lagbench.submission.budget import MOST_VALIDATIONS, Budget, Track, track_of
+from lagbench.tensors import Batch, collate
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.run import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline, count_parameters
-from .catalogue import check_data_set, find
-from .checkpoint import load_weights, round_weights
+from .baseline import Baseline, DatasetInfo, count_parameters
+from .catalogue import find
+from .checkpoint import Checkpoint, load, load_weights, round_weights, save
 from .dataset_info import find_forcing, read_dataset_info
-from .job import TrainingJob
-from .machine import (
-    bound_memory,
-    check_compiler,
-    choose_device,
-    explain_memory_errors,
-    is_helper,
-    use_threads,
-)
+from .machine import choose_device, hardware, is_helper, use_threads
 from .optimisation import Optimisation
 from .randomness import derive_seed, preserve_generators, seed_generators
 from .recipe import Recipe, TrainingOptions, recipe_for
-from .recipe_changes import describe_start
-from .rollout import load_validation, scenario_batch, scenario_paths
-from .run_folder import RunFolder
-from .start import TrainingStart, start_from
-from .training_log import STOPPED_EARLY, TrainingLog
-from .training_loop import TrainingLoop, launch_fabric, silence_lightning
+from .rollout import Validation, load_validation, scenario_batch, scenario_paths
+from .start import describe_start, start_from
+from .training_log import OVER, STOPPED_EARLY, TrainingLog
 
-MEMORY_HINT = (
-    "lower --set training.batch=1, then the model: model.latent, .layers, .widths or "
-    ".lags"
-)
+WEIGHTS = "weights.safetensors"  # the best weights in bfloat16, to predict from
+CHECKPOINT = "checkpoint.safetensors"  # the last state, to go on from
+LOG = "training.json"  # the log of the training
+LOSSES = "losses.csv"  # loss terms and learning rate of some steps
+LOG_FORMAT = 1  # of training.json
+# libraries whose versions decide the result
+LIBRARIES = ("lagbench", "torch", "torch-geometric", "numpy", "scipy")
 FIT_STEPS = 1  # a closed form counts as one step
 READING = "reading"  # the stage in which a fit reads scenarios
 FITTING = "fitting"  # the stage in which it evaluates
-
-# what an interrupted training says that has stored nothing yet
-NOTHING_STORED = "the earlier training in the folder is still there"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,19 +108,8 @@ class TrainingResult:
     wall_seconds: float  # time of all runs [s]
 
 
-FORCING = {
-    "body_force": "the force that drives the flow",
-    "obstacle": "the obstacle in the flow",
-}
-"""What drives a flow beside walls, by its name in batches."""
-
-
 class UnseenForcingWarning(UserWarning):
     """A model is trained that does not see what drives the flow."""
-
-
-class DamagedLogWarning(UserWarning):
-    """A training is finished, but training.json is missing, damaged or of another."""
 
 
 def train(
@@ -127,16 +123,13 @@ def train(
     start: str | Path | None = None,
     root: str | Path | None = None,
     output: str | Path | None = None,
-    resume: bool = True,
     fresh: bool = False,
     device: str = "auto",
-    processes: int = 1,
     threads: int | None = None,
-    workers: int = 0,
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> TrainingResult:
-    """Train a baseline on the windows of a split.
+    """Train a baseline on the windows of a split; go on with an earlier run if any.
 
     Args:
         baseline: name of the baseline.
@@ -145,48 +138,40 @@ def train(
         recipe: variant of the recipe, or a YAML file of recipes.
         settings: changes to the recipe, as in ``training.steps=100``.
         seed: seed in place of the recipe's.
-        start: weights to start from, perhaps of another size; random weights when
-            None.
+        start: weights to start from, perhaps of another size; random ones when None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
         output: folder of the run; by default
             ``runs/<split>/<size>[-<variant>]/<baseline>[-further]-<seed>``.
-        resume: go on with what an earlier run left there.
-        fresh: train anew; it wins over ``resume``. An earlier training in the folder is
-            replaced when the new one stores its first file.
+        fresh: train anew, and replace what an earlier run left in the folder.
         device: ``cpu``, ``cuda`` or ``auto``.
-        processes: processes, one device each (torchrun's own number where that started
-            us).
         threads: threads of a process on the CPU; by default its share of the cores.
-        workers: processes that read windows ahead; 0 reads them in between.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
     An :class:`UnseenForcingWarning` tells of a force or an obstacle that the model does
-    not see. A :class:`DamagedLogWarning` tells that a training is finished, and that
-    its training.json is missing, damaged or the log of another training.
+    not see.
 
     Raises:
         UsageError: unknown baseline, split, size, recipe or key; images that gravity
-            or a force forbids; or the folder holds another training, or weights
-            without their checkpoint; weights to start from that do not fit; a model
-            whose weights no file can hold.
+            or a force forbids; the folder holds another training; weights to start from
+            that do not fit.
         DataError: the data set is missing or damaged.
         UnreadableFileError: the checkpoint in the folder is damaged.
-        WorkFailedError: the loss is not finite, memory or disk is full.
+        WorkFailedError: the loss is not finite, or the disk is full.
         KeyboardInterrupt: interrupted; the state after the last step is stored. Of a
-            model that is fitted as a whole nothing is stored; the exception says so.
+            model that is fitted as a whole nothing is stored.
     """
     entry = find(baseline)
     tier, root_folder, known_splits = locate(split, size, root=root, registry=registry)
+    entry.model.check_data_set(
+        tier.split, tier.name, tier.box, is_full_box=tier.is_full_box
+    )
     initial = None
-    learned_options = None
     if start is not None:
         initial = start_from(
             start, entry, tier, root=root_folder, registry=known_splits
         )
-        learned_options = initial.options
-    check_data_set(entry, tier)
     plan = recipe_for(
         entry,
         tier.split,
@@ -194,13 +179,10 @@ def train(
         variant=recipe,
         settings=settings,
         seed=seed,
-        learned=learned_options,
+        learned=None if initial is None else initial.options,
     )
-    check_symmetry(
-        plan.model.get("symmetry"),
-        tier,
-        find_forcing=functools.partial(find_forcing, tier, root_folder),
-    )
+    forcing = functools.partial(find_forcing, tier, root_folder)
+    check_symmetry(plan.model.get("symmetry"), tier, find_forcing=forcing)
     if initial is not None:
         info = initial.info
         plan = replace(plan, start=initial.record)
@@ -209,167 +191,106 @@ def train(
             tier.split, tier.name, root=root_folder, registry=known_splits
         )
 
-    folder = _open_folder(output, plan, initial)
-    # torchrun's number of processes where it started us
-    world_size = int(os.environ.get("WORLD_SIZE", processes))
-    local_world_size = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
-    earlier = folder.find_checkpoint(
-        plan, info, processes=world_size, resume=resume, fresh=fresh
-    )
-    job = TrainingJob(
-        recipe=plan,
-        info=info,
-        folder=folder,
-        earlier=earlier,
-        root=root_folder,
-        registry=known_splits,
-        device=choose_device(device),
-        processes=world_size,
-        workers=workers,
-        meter=Meter(progress),
-    )
-    bound_memory()
+    if output is None:
+        further = "-further" if initial is not None else ""
+        name = f"{baseline}{further}-{plan.training.seed}"
+        output = Path("runs") / plan.name / name
+    folder = expand_home(output, "--output")
+    check_writable(folder, option="--output")
+    earlier = None
+    if fresh and not is_helper():
+        for file_name in (WEIGHTS, CHECKPOINT, LOG, LOSSES):
+            (folder / file_name).unlink(missing_ok=True)
+    elif (folder / CHECKPOINT).exists():
+        earlier = _load_earlier(folder, plan, info)
+
     with (
         preserve_generators(),
-        use_threads(threads, processes=local_world_size),
-        explain_memory_errors(MEMORY_HINT),
+        use_threads(threads),
+        _connected_processes(choose_device(device)) as machine,
     ):
-        model = _build_model(job, entry.model, initial)
-        _warn_of_unseen_forcing(model, tier, root_folder)
-        return _train_model(job, model)
-
-
-def _train_model(job: TrainingJob, model: Baseline) -> TrainingResult:
-    """Fit a model or descend on its loss."""
-    if job.earlier is None and not is_helper():
-        job.folder.note_earlier_files()
-    if model.closed_form:
-        try:
-            log, steps = fit(job, model)
-        except KeyboardInterrupt:
-            advice = "a fit stores nothing before its end: the same command begins anew"
-            raise KeyboardInterrupt(advice) from None
-    else:
-        log, steps = descend(job, model)
-    result = _result(job, model, log, steps)
-    if job.earlier is not None and result.first_step == result.step:
-        _warn_of_damaged_log(job)
-    return result
-
-
-def _warn_of_damaged_log(job: TrainingJob) -> None:
-    """Warn where training.json is not the log of a training that was over before.
-
-    It is not written anew: hardware and versions of the training may be others than
-    those of today.
-    """
-    if is_helper() or job.earlier is None:
-        return
-    folder = job.folder
-    if folder.has_log_of(job.earlier.training):
-        return
-    message = (
-        f"{folder.log} is missing, damaged, or not the log of the finished training "
-        "beside it; restore the file from a copy, or train anew with --fresh"
-    )
-    warnings.warn(message, DamagedLogWarning, stacklevel=4)
-
-
-def _warn_of_unseen_forcing(model: Baseline, size: Size, root: Path) -> None:
-    """Warn before a training whose model does not see what drives the flow."""
-    if is_helper() or model.forcing_seen is None:
-        return
-    unseen = sorted(find_forcing(size, root) - model.forcing_seen)
-    if not unseen:
-        return
-    names = " and ".join(FORCING[name] for name in unseen)
-    keys = " and ".join(unseen)
-    message = (
-        f"{model.method} does not see {names} of {size.split} ({keys}): it can only "
-        f"learn the mean effect; {_show_forcing(model, unseen)}"
-    )
-    warnings.warn(message, UnseenForcingWarning, stacklevel=3)
-
-
-def _show_forcing(model: Baseline, unseen: Sequence[str]) -> str:
-    """Return which option or model shows what drives the flow."""
-    known_options = type(model.options).model_fields
-    if all(name in known_options for name in unseen):
-        options = " ".join(f"--set model.{name}=true" for name in unseen)
-        return f"to show it to the model, add {options}"
-    settings = " and ".join(f"model.{name}=true" for name in unseen)
-    networks = f"graph networks, MLP and LSTM see it with {settings}"
-    if "body_force" in unseen:
-        return f"{networks}, and NeuralMPM with model.body_force=true"
-    return f"{networks}, and NeuralMPM without an option"
-
-
-def _open_folder(
-    output: str | Path | None, recipe: Recipe, initial: TrainingStart | None
-) -> RunFolder:
-    """Return the folder of a run, if it can be written.
-
-    Refuse one whose checkpoint or weights are the start: they would be overwritten.
-    """
-    if output is None:
-        name = recipe.baseline
-        if initial is not None:
-            name += "-further"
-        output = Path("runs") / recipe.name / f"{name}-{recipe.training.seed}"
-    folder = RunFolder(expand_home(output, "--output"))
-    check_writable(folder.path, option="--output")
-    if initial is not None and folder.holds(initial.path):
-        raise UsageError(
-            "this training would overwrite the weights that it starts from",
-            where="--start",
-            expected="weights in another folder",
-            got=str(initial.path),
-            fix="name another folder with --output",
+        seed_generators(derive_seed(plan.training.seed))
+        model = entry.model.build(plan.model, info)
+        if earlier is not None:
+            load_weights(model, earlier.weights, where=str(folder / CHECKPOINT))
+        elif initial is not None:
+            initial.load_into(model)
+        if not is_helper() and model.forcing_seen is not None:
+            unseen = sorted(forcing() - model.forcing_seen)
+            if unseen:
+                message = (
+                    f"{model.method} does not see the {' and '.join(unseen)} of "
+                    f"{tier.split}: it can only learn the mean effect; graph networks, "
+                    f"MLP and LSTM see it with --set model.{unseen[0]}=true"
+                )
+                warnings.warn(message, UnseenForcingWarning, stacklevel=2)
+        training = _Training(
+            plan,
+            info,
+            folder=folder,
+            model=model,
+            earlier=earlier,
+            root=root_folder,
+            registry=known_splits,
+            device=machine,
+            meter=Meter(progress),
         )
-    return folder
+        if model.closed_form:
+            return training.fit()
+        return training.descend()
 
 
-def _build_model(
-    job: TrainingJob, model_class: type[Baseline], initial: TrainingStart | None
-) -> Baseline:
-    """Return the model with the weights of checkpoint or start, else random ones."""
-    seed_generators(derive_seed(job.recipe.training.seed))
-    model = model_class.build(job.recipe.model, job.info)
-    if job.earlier is not None:
-        load_weights(model, job.earlier.weights, where=str(job.folder.checkpoint))
-    elif initial is not None:
-        initial.load_into(model)
-    return model
+def _load_earlier(folder: Path, plan: Recipe, info: DatasetInfo) -> Checkpoint:
+    """Return the state of an earlier training, if it is of the same recipe and data.
+
+    Raises:
+        UsageError: the folder holds another training.
+        DataError: the training began on another version of the data set.
+    """
+    earlier = load(folder / CHECKPOINT)
+    asked = plan.as_json()
+    differences = []
+    for key in ("baseline", "name", "model", "training", "start"):
+        if earlier.recipe.get(key) != asked.get(key):
+            differences.append(key)
+    if earlier.training.get("processes", 1) != _count_processes():
+        differences.append("number of processes")
+    if differences:
+        raise UsageError(
+            f"the folder holds a training with another {', '.join(differences)}; name "
+            "another folder with --output, or train anew with --fresh",
+            where=str(folder),
+        )
+    if earlier.info.dataset_sha256 != info.dataset_sha256:
+        raise DataError(
+            "the training began on another version of the data set; train anew with "
+            "--fresh",
+            where=str(folder),
+        )
+    return earlier
 
 
-def _result(
-    job: TrainingJob, model: Baseline, log: TrainingLog, steps: int
-) -> TrainingResult:
-    """Return the result of a training, with the log but for its validations."""
-    first_step = 0
-    if job.earlier is not None:
-        first_step = int(job.earlier.training.get("step", 0))
-    budget = job.budget(log)
-    log_values = asdict(log)
-    del log_values["validation"]
-    return TrainingResult(
-        baseline=job.recipe.baseline,
-        split=job.info.split,
-        size=job.info.size,
-        recipe=job.recipe.name,
-        folder=job.folder.path,
-        weights=job.folder.weights,
-        checkpoint=job.folder.checkpoint,
-        steps=steps,
-        parameters=count_parameters(model),
-        device=budget.device or "",
-        threads=budget.threads or 0,
-        track=track_of(job.info.size, budget),
-        start=describe_start(job.recipe.start),
-        is_fitted=model.closed_form,
-        first_step=first_step,
-        **log_values,
-    )
+def _count_processes() -> int:
+    """Return the processes that train together, as torchrun tells."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
+@contextmanager
+def _connected_processes(device: str) -> Iterator[torch.device]:
+    """Yield the device of this process; connect the processes of torchrun."""
+    if device == "cuda":
+        machine = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+        torch.cuda.set_device(machine)
+    else:
+        machine = torch.device("cpu")
+    if _count_processes() == 1:
+        yield machine
+        return
+    torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+    try:
+        yield machine
+    finally:
+        torch.distributed.destroy_process_group()
 
 
 class StepBatches(Sampler[list[int]]):
@@ -427,199 +348,470 @@ class StepBatches(Sampler[list[int]]):
         return np.where(is_replaced, opening, windows)
 
 
-def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
-    """Train a model by steps; return the log and the steps of the whole training.
+class _Interrupts:
+    """Notes the first interrupt of a user, and lets a second one through."""
 
-    Raises:
-        KeyboardInterrupt: a user interrupted it; the state is stored.
-    """
-    info = job.info
-    options = job.recipe.training
-    data = WindowDataset(
-        info.split,
-        subset=options.windows,
-        size=info.size,
-        root=job.root,
-        registry=job.registry,
-        history=model.history,
-        future=model.future,
-        origin=model.origin,
-        verify=True,
-    )
-    steps = options.total_steps(len(data), processes=job.processes)
-    log = job.start_log()
-    if log.state == STOPPED_EARLY:
-        return log, steps
-    if log.step >= steps:
-        log.state = "finished"
-        return log, steps
-    log.state = "running"
-    if options.compile:
-        check_compiler(job.device)
-        model.compile_layers()
+    def __init__(self) -> None:
+        self.is_set = False
 
-    validation = load_validation(options, info, root=job.root, registry=job.registry)
-    with silence_lightning():
-        fabric = launch_fabric(job)
-        optimizer_state = None
-        if job.earlier is not None:
-            optimizer_state = job.earlier.optimizer
+    @contextmanager
+    def listen(self) -> Iterator[None]:
+        """Listen for a while; signals are the main thread's alone."""
+        handlers = {}
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                handlers[number] = signal.signal(number, self._note)
+        try:
+            yield
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.is_set:
+            raise KeyboardInterrupt
+        self.is_set = True
+
+
+class _Training:
+    """A training in one process, beside others perhaps."""
+
+    def __init__(
+        self,
+        plan: Recipe,
+        info: DatasetInfo,
+        *,
+        folder: Path,
+        model: Baseline,
+        earlier: Checkpoint | None,
+        root: Path,
+        registry: Registry,
+        device: torch.device,
+        meter: Meter,
+    ) -> None:
+        self.plan = plan
+        self.options = plan.training
+        self.info = info
+        self.folder = folder
+        self.model = model
+        self.earlier = earlier  # state to go on from; None at the start
+        self.root = root
+        self.registry = registry
+        self.device = device
+        self.meter = meter
+        self.processes = _count_processes()
+        self.log = TrainingLog()
+        if earlier is not None:
+            self.log = TrainingLog.continue_from(earlier.training)
+        self.first_step = self.log.step
+        self.windows = 0  # of the training subsets
+
+    def descend(self) -> TrainingResult:
+        """Train the model by steps.
+
+        Raises:
+            KeyboardInterrupt: a user interrupted it; the state is stored.
+        """
+        log = self.log
+        options = self.options
+        model = self.model.to(self.device)
+        data = WindowDataset(
+            self.info.split,
+            subset=options.windows,
+            size=self.info.size,
+            root=self.root,
+            registry=self.registry,
+            history=model.history,
+            future=model.future,
+            origin=model.origin,
+            verify=True,
+        )
+        self.windows = len(data)
+        steps = options.total_steps(len(data), processes=self.processes)
+        if log.state == STOPPED_EARLY:
+            return self._result(steps)
+        if log.step >= steps:
+            log.state = "finished"
+            return self._result(steps)
+
+        log.state = "running"
+        if options.compile:
+            model.compile_layers()
         optimisation = Optimisation(
-            model.to(fabric.device),
+            model,
             options,
             steps=steps,
-            processes=job.processes,
+            processes=self.processes,
             step=log.step,
-            optimizer_state=optimizer_state,
+            state=None if self.earlier is None else self.earlier.optimizer,
         )
-        loop = TrainingLoop(
-            job,
-            log,
-            fabric=fabric,
-            optimisation=optimisation,
-            validation=validation,
-            windows=len(data),
+        rank = int(os.environ.get("RANK", "0"))
+        sampler = WindowSampler(
+            data, seed=options.seed, rank=rank, ranks=self.processes
+        )
+        batches = StepBatches(sampler, options, first=log.step, last=steps)
+        loader = DataLoader(data, batch_sampler=batches, collate_fn=collate)
+        validation = load_validation(
+            options, self.info, root=self.root, registry=self.registry
+        )
+        validations = 0
+        if validation is not None:
+            validations = options.count_validations(
+                steps,
+                trained=options.batch * model.future,
+                rolled=sum(validation.frames.values()),
+            )
+        forward: torch.nn.Module = model
+        if self.processes > 1:
+            forward = DistributedDataParallel(model)
+
+        interrupts = _Interrupts()
+        model.train()
+        self.meter.begin("training", total=steps, scenarios=steps, done=log.step)
+        with interrupts.listen():
+            if validation is not None and self.plan.start and not log.validation:
+                self._validate(validation, optimisation)
+                self._store(optimisation)
+            for batch in loader:
+                seed = derive_seed(options.seed, log.step, rank)
+                seed_generators(seed)
+                generator = torch.Generator(device=self.device).manual_seed(seed)
+                # A cache of rounded weights would sum the gradients of their uses in
+                # bfloat16.
+                with torch.autocast(
+                    self.device.type,
+                    dtype=torch.bfloat16,
+                    enabled=options.precision == "bf16",
+                    cache_enabled=False,
+                ):
+                    terms = forward(batch.to(self.device), generator)
+                    loss = optimisation.weigh(terms)
+                try:
+                    optimisation.make_step(loss)
+                except Exception:
+                    log.state = "failed"
+                    self._write_log(steps)
+                    raise
+                self._log_step(optimisation)
+
+                if validation is not None and options.is_validated(
+                    log.step, steps=steps, validations=validations
+                ):
+                    self._validate(validation, optimisation)
+                if log.step >= steps:
+                    log.state = "finished"
+                elif self._is_patience_over():
+                    log.state = STOPPED_EARLY
+                elif self._sum_over_processes(float(interrupts.is_set)) > 0:
+                    log.state = "interrupted"
+                every = options.checkpoint_every or max(1, steps // 20)
+                if log.state != "running" or log.step % every == 0:
+                    self._store(optimisation)
+                if log.state == "interrupted":
+                    raise KeyboardInterrupt
+                if log.state in OVER:
+                    break
+        return self._result(steps)
+
+    def _log_step(self, optimisation: Optimisation) -> None:
+        """Count a step, and log its loss where that is due."""
+        log = self.log
+        options = self.options
+        log.step = optimisation.step
+        log.windows_seen = log.step * options.batch * self.processes
+        log.epochs = log.windows_seen / self.windows
+        is_last = log.step >= optimisation.steps
+        if is_last or log.step == 1 or log.step % options.log_every == 0:
+            terms = {}
+            for name, value in optimisation.terms.items():
+                terms[name] = float(value)
+            log.loss = terms
+            self.meter.stage = f"loss {terms['total']:.3g}"
+            if not is_helper():
+                row = {"step": log.step, "learning_rate": optimisation.learning_rate}
+                _append_row(self.folder / LOSSES, {**row, **terms})
+        self.meter.count(1, scenarios=1)
+
+    def _validate(self, validation: Validation, optimisation: Optimisation) -> None:
+        """Validate in the first process; all processes act on the value."""
+        self._read_clocks()
+        before = self.log.cpu_seconds
+        value = 0.0
+        if not is_helper():
+            with optimisation.use_mean():
+                value = validation.measure(self.model)
+        value = self._sum_over_processes(value)
+        self._read_clocks()
+        self.log.validation_cpu_seconds += self.log.cpu_seconds - before
+        is_best = self.log.add_validation(validation.metric, value)
+        if is_best:
+            self._publish(optimisation)
+
+    def _is_patience_over(self) -> bool:
+        patience = self.options.patience
+        return patience is not None and self.log.validations_since_best() >= patience
+
+    def _sum_over_processes(self, value: float) -> float:
+        if self.processes == 1:
+            return value
+        total = torch.tensor(value, dtype=torch.float64, device=self.device)
+        torch.distributed.all_reduce(total)
+        return float(total)
+
+    def _publish(self, optimisation: Optimisation) -> None:
+        """Write the weights to predict from."""
+        if is_helper():
+            return
+        with optimisation.use_mean():
+            weights = round_weights(self.model)
+            save(self.folder / WEIGHTS, self._checkpoint(weights))
+
+    def _store(self, optimisation: Optimisation) -> None:
+        """Write checkpoint and log; the weights get the budget of the whole training.
+
+        Raises:
+            WorkFailedError: weights are not finite; the files stay as they are.
+        """
+        if is_helper():
+            return
+        weights = self.model.state_dict()
+        for value in weights.values():
+            if not torch.isfinite(value).all():
+                raise optimisation.not_finite()
+        self._read_clocks()
+        state = optimisation.state_tensors()
+        save(self.folder / CHECKPOINT, self._checkpoint(weights, state))
+        self._write_log(optimisation.steps)
+        if self.log.best_step is None:
+            self._publish(optimisation)
+            return
+        best = load(self.folder / WEIGHTS)
+        budget = self._budget().model_dump(mode="json")
+        training = {**best.training, "budget": budget}
+        save(self.folder / WEIGHTS, replace(best, training=training))
+
+    def _read_clocks(self) -> None:
+        self.log.read_clocks(self.processes, device=self.device.type)
+
+    def _checkpoint(
+        self, weights: Mapping[str, Tensor], state: Mapping[str, Tensor] | None = None
+    ) -> Checkpoint:
+        """Return a checkpoint of the present step."""
+        training = {
+            "recipe": self.plan.as_json(),
+            "processes": self.processes,
+            **asdict(self.log),
+            "budget": self._budget().model_dump(mode="json"),
+        }
+        return Checkpoint(
+            baseline=self.plan.baseline,
+            options=self.plan.model,
+            info=self.info,
+            weights=weights,
+            training=training,
+            optimizer=state,
         )
 
-        def load_batches(rank: int, ranks: int) -> DataLoader[TensorWindow]:
-            sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
-            batches = StepBatches(sampler, options, first=log.step, last=steps)
-            return _make_loader(data, batches, workers=job.workers)
+    def _write_log(self, steps: int) -> None:
+        if is_helper():
+            return
+        info = self.info
+        budget = self._budget()
+        versions = {"python": platform.python_version()}
+        for name in LIBRARIES:
+            versions[name] = version(name)
+        content = {
+            "format": LOG_FORMAT,
+            "baseline": self.plan.baseline,
+            "method": self.model.method,
+            "recipe": self.plan.as_json(),
+            "split": info.split,
+            "size": info.size,
+            "dataset_version": info.version,
+            "dataset_sha256": info.dataset_sha256,
+            "parameters": count_parameters(self.model),
+            "processes": self.processes,
+            "hardware": hardware(self.device.type),
+            "versions": versions,
+            "budget": budget.model_dump(mode="json"),
+            "track": track_of(info.size, budget),
+            "steps": steps,
+            "windows": self.windows,
+            **asdict(self.log),
+        }
+        text = json.dumps(content, indent=2, sort_keys=True)
+        write_atomically(self.folder / LOG, text.encode() + b"\n", option="--output")
 
-        loop.run(load_batches)
-    if log.state == "interrupted":
-        if job.folder.has_earlier_files:
-            raise KeyboardInterrupt(NOTHING_STORED)
-        raise KeyboardInterrupt
-    return log, steps
+    def _budget(self) -> Budget:
+        """Return the budget of the training so far, for predictions and entries.
 
+        Hours include those of the weights of its start; epochs, steps and validations
+        are its own.
+        """
+        log = self.log
+        machine = hardware(self.device.type)
+        name = machine["processor" if self.device.type == "cpu" else "device"]
+        took = (self.plan.start or {}).get("took", {})
 
-def _make_loader(
-    data: WindowDataset, batches: StepBatches, *, workers: int
-) -> DataLoader[TensorWindow]:
-    """Return a loader of batches, with processes that read ahead if asked."""
-    if not workers:
-        return DataLoader(data, batch_sampler=batches, collate_fn=collate)
-    return DataLoader(
-        data,
-        batch_sampler=batches,
-        collate_fn=collate,
-        num_workers=workers,
-        persistent_workers=True,
-        multiprocessing_context="spawn",
-    )
+        def sum_hours(seconds: float, key: str) -> float | None:
+            start_hours = took.get(key, 0.0)
+            if start_hours is None:
+                return None
+            return round_digits(seconds / 3600.0 + start_hours, 6)
 
-
-def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
-    """Fit a model to scenarios of train; return the log and the number of steps, 1.
-
-    A fit that was finished before is not repeated. :class:`Baseline` describes what the
-    method ``fit`` of the model gets and returns.
-    """
-    log = job.start_log()
-    if job.earlier is not None:
-        log.state = "finished"
-        return log, FIT_STEPS
-    options = job.recipe.training
-    if options.compile:
-        model.compile_layers()  # refuses: a closed form has none
-    if options.ema:
-        raise UsageError(
-            f"{model.method} takes no steps to average over",
-            where="training.ema",
-            expected=0.0,
-            got=options.ema,
-            fix="leave the option out",
+        validations = []
+        for entry in log.validation:
+            value = entry[str(log.metric)]
+            if math.isfinite(value):
+                validations.append((int(entry["step"]), value))
+        # Of too many validations every n-th stays, the last one among them.
+        stride = max(1, math.ceil(len(validations) / MOST_VALIDATIONS))
+        chosen = validations[::-1][::stride]
+        training_seconds = log.cpu_seconds - log.validation_cpu_seconds
+        return Budget(
+            windows=log.windows_seen or None,
+            epochs=round_digits(log.epochs, 6),
+            steps=log.step,
+            start_steps=took.get("steps"),
+            cpu_hours=sum_hours(training_seconds, "cpu_hours"),
+            validation_hours=sum_hours(log.validation_cpu_seconds, "validation_hours"),
+            gpu_hours=sum_hours(log.gpu_seconds, "gpu_hours"),
+            device=str(name).encode("ascii", "replace").decode()[:100],
+            threads=machine["threads"],
+            metric=log.metric,
+            best=log.best_value,
+            best_step=log.best_step,
+            validations=tuple(chosen[::-1]),
         )
 
-    if model.fits_batches:
-        most = getattr(model.options, "scenarios", None)
-        scenarios = _read_scenarios(job, most=most)
-        evaluations = int(getattr(model, "evaluations", 0))
-        count = functools.partial(_count_evaluations, job.meter, evaluations)
-        numbers = model.fit(scenarios, count=count)  # type: ignore[operator]
-    else:
-        positions = _positions(_read_scenarios(job))
-        numbers = model.fit(positions)  # type: ignore[operator]
-    log.step = FIT_STEPS
-    for name, value in numbers.items():
-        log.loss[name] = float(value)
-    log.epochs = 1.0
-    validation = load_validation(
-        options, job.info, root=job.root, registry=job.registry
-    )
-    if validation is not None:
-        with log.time_validation(device=job.device):
+    def _result(self, steps: int) -> TrainingResult:
+        """Return the result of the training, with the log but for its validations."""
+        budget = self._budget()
+        log_values = asdict(self.log)
+        del log_values["validation"]
+        return TrainingResult(
+            baseline=self.plan.baseline,
+            split=self.info.split,
+            size=self.info.size,
+            recipe=self.plan.name,
+            folder=self.folder,
+            weights=self.folder / WEIGHTS,
+            checkpoint=self.folder / CHECKPOINT,
+            steps=steps,
+            parameters=count_parameters(self.model),
+            device=budget.device or "",
+            threads=budget.threads or 0,
+            track=track_of(self.info.size, budget),
+            start=describe_start(self.plan.start),
+            is_fitted=self.model.closed_form,
+            first_step=self.first_step,
+            **log_values,
+        )
+
+    def fit(self) -> TrainingResult:
+        """Fit the model to scenarios of train; a finished fit is not repeated.
+
+        :class:`Baseline` describes what the method ``fit`` of the model gets and
+        returns.
+        """
+        log = self.log
+        model = self.model
+        if self.earlier is not None:
+            log.state = "finished"
+            return self._result(FIT_STEPS)
+        if model.fits_batches:
+            most = getattr(model.options, "scenarios", None)
+            evaluations = int(getattr(model, "evaluations", 0))
+            counter = functools.partial(self._count_evaluations, evaluations)
+            scenarios = self._read_scenarios(most=most)
+            numbers = model.fit(scenarios, count=counter)  # type: ignore[operator]
+        else:
+            positions = (
+                scenario.position.transpose(0, 1).numpy()
+                for scenario in self._read_scenarios()
+            )
+            numbers = model.fit(positions)  # type: ignore[operator]
+        log.step = FIT_STEPS
+        log.epochs = 1.0
+        for name, value in numbers.items():
+            log.loss[name] = float(value)
+
+        validation = load_validation(
+            self.options, self.info, root=self.root, registry=self.registry
+        )
+        if validation is not None:
+            self._read_clocks()
+            before = log.cpu_seconds
             value = validation.measure(model)
-        log.add_validation(validation.metric, value)
-    log.state = "finished"
-    log.read_clocks(device=job.device)
+            self._read_clocks()
+            log.validation_cpu_seconds += log.cpu_seconds - before
+            log.add_validation(validation.metric, value)
+        log.state = "finished"
+        self._read_clocks()
+        save(self.folder / WEIGHTS, self._checkpoint(round_weights(model)))
+        save(self.folder / CHECKPOINT, self._checkpoint(model.state_dict()))
+        self._write_log(FIT_STEPS)
+        return self._result(FIT_STEPS)
 
-    exact_weights = {}
-    for name, weight in model.state_dict().items():
-        exact_weights[name] = weight.detach()
-    rounded = job.checkpoint(log, round_weights(model))
-    exact = job.checkpoint(log, exact_weights)
-    job.folder.save(job.folder.weights, rounded)
-    job.folder.save(job.folder.checkpoint, exact)
-    job.folder.write_log(job.log_as_json(model, log, steps=FIT_STEPS))
-    return log, FIT_STEPS
+    def _count_evaluations(self, evaluations: int, evaluated: int) -> None:
+        """Count what a fit has evaluated. The first count begins a stage of its own.
 
+        A scenario is read in less time than an evaluation takes, so they are not
+        counted together: the rate would be of both.
 
-def _positions(scenarios: Iterator[Batch]) -> Iterator[NDArray[np.float32]]:
-    """Yield the positions of each scenario, shape [frame, particle, 2]."""
-    for scenario in scenarios:
-        yield scenario.position.transpose(0, 1).numpy()
-
-
-def _count_evaluations(meter: Meter, evaluations: int, evaluated: int) -> None:
-    """Count what a fit has evaluated. The first count begins a stage of its own.
-
-    A scenario is read in less time than an evaluation takes, so they are not counted
-    together: the rate would be of both.
-
-    Args:
-        meter: counts the work of the training.
-        evaluations: how many evaluations the fit makes, at most.
-        evaluated: how many were made since the last count.
-    """
-    if meter.stage == FITTING:
-        meter.count(evaluated, scenarios=evaluated)
-        return
-    meter.begin(
-        FITTING,
-        total=evaluations,
-        scenarios=evaluations,
-        done=evaluated,
-        unit="evaluations",
-    )
-
-
-def _read_scenarios(job: TrainingJob, *, most: int | None = None) -> Iterator[Batch]:
-    """Yield each training scenario as a batch of one window.
-
-    Args:
-        job: the training.
-        most: scenarios to read, the first ones; all when None.
-    """
-    size = job.registry.size(job.info.split, job.info.size)
-    viscosity = size.viscosity()
-    paths: list[Path] = []
-    for subset in job.recipe.training.windows:
-        files = scenario_paths(
-            job.info.split,
-            subset=subset,
-            size=job.info.size,
-            root=job.root,
-            registry=job.registry,
+        Args:
+            evaluations: how many evaluations the fit makes, at most.
+            evaluated: how many were made since the last count.
+        """
+        if self.meter.stage == FITTING:
+            self.meter.count(evaluated, scenarios=evaluated)
+            return
+        self.meter.begin(
+            FITTING,
+            total=evaluations,
+            scenarios=evaluations,
+            done=evaluated,
+            unit="evaluations",
         )
-        check_contents(size, job.root, files)
-        paths += files.values()
-    paths = paths[:most]
-    job.meter.begin(READING, total=len(paths), scenarios=len(paths), unit="scenarios")
-    for path in paths:
-        scenario = scenario_batch(path, viscosity=viscosity)
-        # A fit may evaluate what it has read before it reads on.
-        if job.meter.stage == READING:
-            job.meter.count(1, scenarios=1)
-        yield scenario
+
+    def _read_scenarios(self, *, most: int | None = None) -> Iterator[Batch]:
+        """Yield each training scenario as a batch of one window.
+
+        Args:
+            most: scenarios to read, the first ones; all when None.
+        """
+        size = self.registry.size(self.info.split, self.info.size)
+        paths: list[Path] = []
+        for subset in self.options.windows:
+            files = scenario_paths(
+                self.info.split,
+                subset=subset,
+                size=self.info.size,
+                root=self.root,
+                registry=self.registry,
+            )
+            check_contents(size, self.root, files)
+            paths += files.values()
+        paths = paths[:most]
+        count = len(paths)
+        self.meter.begin(READING, total=count, scenarios=count, unit="scenarios")
+        for path in paths:
+            scenario = scenario_batch(path, viscosity=size.viscosity())
+            # A fit may evaluate what it has read before it reads on.
+            if self.meter.stage == READING:
+                self.meter.count(1, scenarios=1)
+            yield scenario
+
+
+def _append_row(path: Path, row: Mapping[str, object]) -> None:
+    """Append a row to a CSV file, after a header where the file is new.
+
+    After a crash the file may have rows of steps that are made again.
+    """
+    is_new = not path.exists()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, [*row])
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
@@ -60,28 +59,12 @@ class TrainingLog:
         """
         cpu = _processor_seconds()
         wall = time.monotonic()
-        wall_elapsed = wall - self._wall
         self.cpu_seconds += (cpu - self._cpu) * processes
-        self.wall_seconds += wall_elapsed
+        self.wall_seconds += wall - self._wall
         if device != "cpu":
-            self.gpu_seconds += wall_elapsed * processes
+            self.gpu_seconds += (wall - self._wall) * processes
         self._cpu = cpu
         self._wall = wall
-
-    @contextmanager
-    def time_validation(
-        self, processes: int = 1, *, device: str = "cpu"
-    ) -> Iterator[None]:
-        """Add the processor time of the ``with`` block as that of a validation.
-
-        One process validates, and the others wait. The time of each counts
-        (:meth:`read_clocks`). It is part of ``cpu_seconds`` too.
-        """
-        self.read_clocks(processes, device=device)
-        before = self.cpu_seconds
-        yield
-        self.read_clocks(processes, device=device)
-        self.validation_cpu_seconds += self.cpu_seconds - before
 
     def add_validation(self, metric: str, value: float) -> bool:
         """Add a validation at the present step; return whether it is the best."""
