@@ -250,7 +250,9 @@ def check_data(
             f"data at hand are {target.version}"
         )
         warnings.warn(message, OtherVersionWarning, stacklevel=2)
-    if target.box != trained.box or target.frame_interval != trained.frame_interval:
+    same_box = target.box == trained.box
+    same_interval = target.frame_interval == trained.frame_interval
+    if tier.name != trained.size and not (same_box and same_interval):
         raise UsageError(
             f"{target.split} {target.size} {target.version} has another box or frame "
             "interval than the data of the training; train on it",

@@ -41,10 +41,12 @@ def use_threads(count: int | None) -> Iterator[None]:
 
     By default it is OMP_NUM_THREADS, else a process's share of the cores.
     """
+    environment = os.environ.get("OMP_NUM_THREADS", "")
+    if not count and environment.isdecimal():
+        count = int(environment)
     if not count:
         processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-        share = available_cores() // processes
-        count = max(1, int(os.environ.get("OMP_NUM_THREADS", share)))
+        count = max(1, available_cores() // processes)
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import json
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

@@ -8,7 +8,6 @@ from lagbench.errors import UnreadableFileError
 from lagbench.submission.provenance import StartWeights, TrainingProvenance
 
 from .checkpoint import Checkpoint
-from .recipe_changes import list_settings
 
 START_DIGITS = 12  # digits of a SHA-256 that provenance names
 
@@ -20,7 +19,7 @@ def training_provenance(checkpoint: Checkpoint) -> TrainingProvenance:
         UnreadableFileError: the record of the training in the weights is damaged.
     """
     info = checkpoint.info
-    recipe = checkpoint.training.get("recipe", {})
+    recipe = checkpoint.recipe
     start = recipe.get("start")
     start_weights = None
     try:
@@ -34,14 +33,10 @@ def training_provenance(checkpoint: Checkpoint) -> TrainingProvenance:
             subsets=tuple(recipe.get("training", {}).get("windows", ("train",))),
             recipe=str(recipe.get("name")),
             step=checkpoint.training.get("step", 0),
-            overrides=list_settings(recipe),
+            overrides=tuple(recipe.get("settings", ())),
             start=start_weights,
         )
     except (ValidationError, TypeError, KeyError) as error:
         raise UnreadableFileError(
-            "the weights record a damaged training",
-            where=f"{info.split} {info.size}",
-            expected="a recipe, subsets and a step, as `lagbench train` records them",
-            got=type(error).__name__,
-            fix="train the model with `lagbench train`",
+            f"the weights record a damaged training: {error!r}"
         ) from error

@@ -331,8 +331,8 @@ def recipe_for(
         layers["training"]["seed"] = seed
 
     where = f"{entry.name}, {name}"
-    model = _check(entry.model.Options, layers["model"], f"{where}, model")
-    training = _check(TrainingOptions, layers["training"], f"{where}, training")
+    model = check_options(entry.model.Options, layers["model"], f"{where}, model")
+    training = check_options(TrainingOptions, layers["training"], f"{where}, training")
     return Recipe(
         baseline=entry.name,
         name=name,
@@ -355,11 +355,12 @@ def change_options(
     layers: Layer = {"model": dict(options), "training": {}}
     for setting in settings:
         layers = _merge(layers, _parse_setting(setting))
-    before = _check(entry.model.Options, dict(options), "--set").model_dump(mode="json")
-    after = _check(entry.model.Options, layers["model"], "--set").model_dump(
-        mode="json"
-    )
-    fixed = entry.model.Options.in_training | entry.model.Options.of_weights
+    model_options = entry.model.Options
+    old = check_options(model_options, dict(options), "--set")
+    new = check_options(model_options, layers["model"], "--set")
+    before = old.model_dump(mode="json")
+    after = new.model_dump(mode="json")
+    fixed = model_options.in_training | model_options.of_weights
     changed = [f"model.{name}" for name in sorted(fixed) if before[name] != after[name]]
     changed += [f"training.{name}" for name in layers["training"]]
     if changed:
@@ -416,7 +417,7 @@ def _parse_setting(text: str) -> Layer:
     return dict(layer)
 
 
-def _check(options: type[OptionsT], values: Layer, where: str) -> OptionsT:
+def check_options(options: type[OptionsT], values: Layer, where: str) -> OptionsT:
     """Return checked options.
 
     Raises:

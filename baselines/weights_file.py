@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -14,7 +12,6 @@ from lagbench.submission.provenance import TrainingProvenance
 
 from .checkpoint import load
 from .provenance import training_provenance
-from .recipe_changes import find_refusal, list_effective_settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,19 +22,10 @@ class WeightsFile:
     sha256: str
     is_state: bool  # a state to go on from, with an optimiser
     baseline: str
-    options: Mapping[str, Any]  # of the model, plain values
     data_set: tuple[str, str, str]  # split, size and SHA-256
     seed: int
     provenance: TrainingProvenance
     parameters: int | None  # None where the weights are not rounded
-
-    def list_effective_settings(self, settings: Sequence[str]) -> tuple[str, ...]:
-        """Return the settings of a prediction that change the model."""
-        return list_effective_settings(self.baseline, self.options, settings)
-
-    def find_refusal(self, settings: Sequence[str]) -> str | None:
-        """Return why the model does not take the settings of a prediction."""
-        return find_refusal(self.baseline, self.options, settings)
 
 
 def inspect_weights(path: Path) -> WeightsFile:
@@ -57,7 +45,6 @@ def inspect_weights(path: Path) -> WeightsFile:
         sha256=file_sha256(path),
         is_state=checkpoint.optimizer is not None,
         baseline=checkpoint.baseline,
-        options=checkpoint.options,
         data_set=(info.split, info.size, info.dataset_sha256),
         seed=checkpoint.seed,
         provenance=training_provenance(checkpoint),

@@ -448,8 +448,6 @@ def _changes(training: ScoredTraining) -> str:
 
     A dash stands for a training without a recipe.
     """
-    from lagbench.baselines.recipe_changes import describe_changes  # loads torch
-
     recipe = training.record.get("recipe")
     if not recipe:
         return "; ".join(training.predicted_with) or "-"
@@ -457,6 +455,6 @@ def _changes(training: ScoredTraining) -> str:
     if recipe.get("changed"):
         changes.append(recipe["changed"])
     else:
-        changes += describe_changes(recipe)
+        changes += recipe.get("settings", [])
     changes += training.predicted_with
     return "; ".join(changes) or "none"

@@ -130,9 +130,6 @@ def require_weights(
             )
         if file.sha256 in owners and keeper is None:
             raise _error_of_owned_weights(path, owners[file.sha256])
-        settings = _settings_of(headers[index])
-        _require_known_settings(file, settings)
-        _require_new_use(file, settings, uses)
         _require_made_by(file, headers[index])
         chosen[index] = path
     return tuple(chosen)
@@ -215,46 +212,6 @@ def _settings_of(header: Header) -> tuple[str, ...]:
     if header.provenance is None:
         return ()
     return header.provenance.prediction_overrides
-
-
-def _require_known_settings(file: WeightsFile, settings: Sequence[str]) -> None:
-    """Refuse predictions with options that the model of the weights does not take."""
-    refused = file.find_refusal(settings)
-    if refused is not None:
-        raise UsageError(
-            "the model does not take the options that the predictions state",
-            where=str(file.path),
-            expected="options of the model in the weights",
-            got=ascii(refused)[1:-1][:200],
-            fix="predict with these weights: lagbench predict; or leave them out",
-        )
-
-
-def _require_new_use(
-    file: WeightsFile, settings: Sequence[str], uses: Sequence[WeightsUse]
-) -> None:
-    """Refuse weights with which a rival predicts already, with the same options.
-
-    Options that change nothing in the recipe of the weights do not count.
-
-    Args:
-        file: the weights.
-        settings: options of the new predictions.
-        uses: weights of the rivals, which are the other active entries of the data set.
-    """
-    effective = file.list_effective_settings(settings)
-    for use in uses:
-        is_same_file = use.weights.sha256 == file.sha256
-        if is_same_file and file.list_effective_settings(use.settings) == effective:
-            raise UsageError(
-                "another entry predicts with these weights in the same way",
-                where=str(file.path),
-                expected="predictions of another size, or with options that change the "
-                "model (lagbench predict --set)",
-                got=", ".join(settings) or f"the options of {use.entry.yaml_path}",
-                fix="predict with another option or size; or, if this entry replaces "
-                f"{use.entry.yaml_path}, set that one to status: superseded first",
-            )
 
 
 def _require_kind(file: WeightsFile, kind: Kind | None) -> None:

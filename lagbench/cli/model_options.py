@@ -12,7 +12,7 @@ from lagbench.errors import WorkFailedError, check_installed
 from lagbench.work.machine import address_space_limit
 
 PREDICTION_LIBRARIES = ("torch", "torch_geometric")
-TRAINING_LIBRARIES = (*PREDICTION_LIBRARIES, "lightning_fabric")
+TRAINING_LIBRARIES = (*PREDICTION_LIBRARIES,)
 
 NEEDED_BYTES = 1280 << 20
 """Least address space in which a model is trained [bytes]; tiny ones map 1,040 MiB."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from cyclopts.types import NonNegativeInt, PositiveInt
+from cyclopts.types import NonNegativeInt
 
 from lagbench.data.local import locate
 from lagbench.data.registry import load
@@ -54,7 +54,6 @@ def train_command(
     output: OutputOption = None,
     fresh: bool = False,
     device: DeviceOption = "auto",
-    processes: PositiveInt = 1,
     threads: ThreadsOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -112,7 +111,6 @@ def train_command(
             output=output,
             fresh=fresh,
             device=device,
-            processes=processes,
             threads=threads,
             progress=progress,
         )
@@ -130,14 +128,13 @@ def _warn_of_scorability(
     changes: tuple[str, ...],
 ) -> None:
     """Warn before the training where a user's own data cannot be scored."""
-    from lagbench.baselines.catalogue import check_data_set, find
+    from lagbench.baselines.catalogue import find
     from lagbench.baselines.recipe import recipe_for
 
     tier, folder, _ = locate(split, size, root=root)
     if tier.simulated:
         return
     entry = find(baseline)
-    check_data_set(entry, tier)
     plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=changes)
     is_validated = plan.training.validate_every != 0
     reasons = list(check_scorability(tier, folder, validated=is_validated))

@@ -11,7 +11,7 @@ from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import SUFFIX, Checkpoint, load, restore, save
 from lagbench.baselines.dataset_info import read_dataset_info
-from lagbench.baselines.recipe import validate_options
+from lagbench.baselines.recipe import check_options
 from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
@@ -50,7 +50,7 @@ def build_registered(
     info = read_dataset_info(split, size, root=root, registry=registry)
     model = find(baseline).model
     stated = dict(options or {})
-    validate_options(model.Options, stated, "options", "build_registered")
+    check_options(model.Options, stated, "options")
     return model.build(stated, info)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -13,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.scenario import ScenarioFile
-from lagbench.errors import require
 from lagbench.figures.canvas import encode, figure, pixels_of
 from lagbench.figures.colours import INK
 from lagbench.figures.panels import (
@@ -289,21 +289,15 @@ def plot_losses(
 
 
 def loss_over_steps(folder: Path, term: str = "total") -> LossCurve:
-    """Return the loss of a training from its TensorBoard log."""
-    no_curve = LossCurve(np.empty(0), np.empty(0))
-    logs = folder / "tensorboard"
-    tag = f"loss/{term}"
-    if not logs.is_dir():
-        return no_curve
-
-    module = require(
-        "tensorboard.backend.event_processing.event_accumulator", extra="baselines"
-    )
-    log = module.EventAccumulator(str(logs), size_guidance={"scalars": 0}).Reload()
-    if tag not in log.Tags()["scalars"]:
-        return no_curve
+    """Return the loss of a training from its losses.csv."""
+    path = folder / "losses.csv"
+    if not path.is_file():
+        return LossCurve(np.empty(0), np.empty(0))
     # a training that was continued repeats steps: the last value of a step counts
-    loss_by_step = {entry.step: entry.value for entry in log.Scalars(tag)}
+    loss_by_step = {}
+    with path.open(newline="") as stream:
+        for row in csv.DictReader(stream):
+            loss_by_step[int(row["step"])] = float(row[term])
     steps = sorted(loss_by_step)
     losses = [loss_by_step[step] for step in steps]
     return LossCurve(np.array(steps, float), np.array(losses))

@@ -218,17 +218,9 @@ def check_training(
     record = read_json(folder / RECORD_NAME)
     if not record:
         return
-    from lagbench.baselines.recipe_changes import first_difference  # loads torch
-
     recipe = _recipe(plan, split, model=model, seed=seed).as_json()
     if record.get("recipe") != recipe:
-        difference = first_difference(recipe, record.get("recipe"))
-        raise UsageError(
-            "the run has another recipe",
-            where=str(folder),
-            expected=difference,
-            fix=OTHER_RUN,
-        )
+        raise UsageError(f"the run has another recipe; {OTHER_RUN}", where=str(folder))
     data_hash = plan.hash(split)
     trained_hash = record.get("dataset_sha256")
     if data_hash is not None and trained_hash != data_hash:
@@ -375,29 +367,18 @@ def _recipe(plan: Plan, split: str, *, model: RosterModel, seed: int) -> Recipe:
 
 
 def _settings_for(plan: Plan, model: RosterModel) -> tuple[str, ...]:
-    """Return the changes of the plan that a model can use."""
-    # these load torch
-    from lagbench.baselines.catalogue import find
-    from lagbench.baselines.recipe import (
-        FITTED_OPTIONS,
-        REFUSED_BY_FIT,
-        TrainingOptions,
-    )
+    """Return the changes of the plan that a model can use.
+
+    A plan holds for all models of a split. One that is fitted takes no steps; it is
+    made without the options of the training.
+    """
+    from lagbench.baselines.catalogue import find  # loads torch
 
     if not find(model.baseline).model.closed_form:
         return plan.settings
-    # A plan holds for all models of a split. One that is fitted takes no steps and
-    # refuses the options of steps; it is made without them, as other models with them.
-    unused_options = set(TrainingOptions.model_fields)
-    unused_options.difference_update(FITTED_OPTIONS, REFUSED_BY_FIT)
-    used_settings = []
-    for setting in plan.settings:
-        key, _, _ = setting.partition("=")
-        part, _, name = key.strip().partition(".")
-        option, _, _ = name.partition(".")
-        if part != "training" or option not in unused_options:
-            used_settings.append(setting)
-    return tuple(used_settings)
+    return tuple(
+        setting for setting in plan.settings if not setting.startswith("training.")
+    )
 
 
 def _stale_files(data_hash: str | None, folder: Path) -> list[Path]:

@@ -34,7 +34,7 @@ from studies.thesis.claims import (
     compare_models,
     leading_references,
 )
-from studies.thesis.drawing import SMOOTHED, loss_over_steps, smooth
+from studies.thesis.drawing import SMOOTHED, smooth
 from studies.thesis.split_results import Method, ScoredTraining, Sources, SplitResults
 from studies.thesis.tables import (
     cubic_errors,
@@ -411,20 +411,6 @@ def test_errors_of_interpolated_fields() -> None:
     at_rest = np.zeros((2, 2))
     errors_of_rest = cubic_errors(truth, at_rest)
     assert math.isnan(errors_of_rest["pearson"])
-
-
-def test_losses_are_read_back_from_tensorboard(tmp_path: Path) -> None:
-    """What was logged comes back in the order of steps; no log gives no curve."""
-    tensorboard = pytest.importorskip("torch.utils.tensorboard")
-    writer = tensorboard.SummaryWriter(str(tmp_path / "tensorboard"))
-    for step in (10, 20, 30):
-        writer.add_scalar("loss/total", 1.0 / step, step)
-    writer.close()
-    curve = loss_over_steps(tmp_path)
-    assert curve.steps.tolist() == [10, 20, 30]
-    assert curve.loss == pytest.approx([0.1, 0.05, 1 / 30])
-    assert loss_over_steps(tmp_path, "vorticity").steps.size == 0
-    assert loss_over_steps(tmp_path / "none").steps.size == 0
 
 
 def test_smoothing_is_a_centred_mean() -> None:
