@@ -7,8 +7,7 @@ from its start, in turns, on the same core. So both meet the same load of the ma
 The scenario is the first one of test, or the one that ``--scenario`` names.
 
 Prints the medians of the particle-substeps per second of processor time, and of the
-ratios of the turns, with quartiles. No positions are read: ``solver_against.py``
-compares whole frames.
+ratios of the turns, with quartiles. No positions are read.
 """
 
 from __future__ import annotations
@@ -17,12 +16,14 @@ import argparse
 import os
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from solver_against import HERE, checked_out
 
 from lagbench.baselines.machine import hardware
 from lagbench.data.registry import load
@@ -32,6 +33,21 @@ from lagbench.generators.solver import build
 
 CASES = ("cavity", "curl-noise", "fluid", "multimaterial")
 PARTICLE_SUBSTEPS = 2_000_000  # of a turn
+HERE = Path(__file__).parents[1]
+
+
+@contextmanager
+def checked_out(revision: str) -> Iterator[Path]:
+    """Yield a folder with another commit, which is gone afterwards."""
+    worktree = ["git", "-C", str(HERE), "worktree"]
+    with tempfile.TemporaryDirectory() as folder:
+        other = Path(folder) / "other"
+        add = [*worktree, "add", "--quiet", "--detach", str(other), revision]
+        subprocess.run(add, check=True)
+        try:
+            yield other
+        finally:
+            subprocess.run([*worktree, "remove", "--force", str(other)], check=True)
 
 
 def serve(split: str, size: str, scenario: int | None) -> None:

@@ -60,8 +60,7 @@ NOTES: Mapping[str, str] = {
     ),
     "curl-noise": (
         "The energy decays, and it decays faster if the frequency is higher. The "
-        "equations have no viscosity. The grid acts like one; "
-        "benchmarks/effective_viscosity.py fits its value to the decay at each size."
+        "equations have no viscosity. The grid acts like one."
     ),
 }
 

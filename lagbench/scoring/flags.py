@@ -6,8 +6,7 @@
 ``physics``: kinetic energy, or filled area (in space, volume), far from the truth's.
 
 The thresholds lie between honest predictions of our own splits and predictions made
-from the truth: ``python benchmarks/flag_calibration.py`` prints both, docs/scoring.md
-has its table.
+from the truth: docs/scoring.md has the table.
 
 An honest rollout builds on its own last frame, so its error e(f) = x_pred(f) -
 x_true(f) carries over from frame to frame; a prediction that was put together from the
