@@ -1,211 +1,110 @@
-"""The commands import and adopt, which make local splits."""
+"""The command import, which makes local splits."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from lagbench.data.box import describe_bounds
-from lagbench.data.layout import parse_ids
 from lagbench.errors import UsageError, format_count
-from lagbench.exchange.adoption import adopt, import_split
+from lagbench.exchange.adoption import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.exchange.metadata import parse_kinds
-from lagbench.exchange.trajectory import DataOptions, read_options
 
-from .options import JsonFlag, OutputOption, QuietFlag
+from .options import JsonFlag, QuietFlag
 from .output import print_result, print_warning, progress_bar
-
-DescribeOption = Annotated[
-    Path | None,
-    Parameter(
-        help="YAML file that describes the data (docs/exchange.md); options replace "
-        "its values."
-    ),
-]
-RadiusOption = Annotated[
-    float | None,
-    Parameter(
-        help="Connectivity radius of graph models; at most half a period of the box."
-    ),
-]
-IntervalOption = Annotated[float | None, Parameter(help="Time between two frames.")]
-BoundsOption = Annotated[
-    str | None,
-    Parameter(
-        help="Lowest and highest position of the box along each axis, as in 0,2,0,1."
-    ),
-]
-PeriodicOption = Annotated[
-    str | None,
-    Parameter(help="Axes along which the box is periodic, as in x,y; or none."),
-]
-RescaleFlag = Annotated[
-    bool, Parameter(help="Scale positions so that they fit the unit box.")
-]
-InputFramesOption = Annotated[
-    int | None, Parameter(help="Frames that a model is given; 6 by default.")
-]
-HorizonOption = Annotated[
-    int | None,
-    Parameter(help="Frames to predict; by default all after the given ones."),
-]
-InterestOption = Annotated[
-    str | None,
-    Parameter(
-        help="Frames whose scores are shown, as in 15,25; by default the last one."
-    ),
-]
-CellsOption = Annotated[
-    int | None,
-    Parameter(
-        help="Cells of the score grid across a length of 1: 4 to 4096, in a unit cube "
-        "to 270."
-    ),
-]
-FullBoxFlag = Annotated[
-    bool | None,
-    Parameter(
-        negative="--free-surface",
-        help="Whether material fills the box. Then the error of the vorticity ranks, "
-        "else the distance of particle clouds.",
-    ),
-]
 
 
 def import_command(
-    source: Path,
+    sources: list[Path],
     /,
     *,
     output: Annotated[Path, Parameter(alias="-o")],
-    file_format: Annotated[str | None, Parameter(name="--format")] = None,
+    axes: str | None = None,
+    positions: str | None = None,
     kinds: str | None = None,
-    describe: DescribeOption = None,
-    radius: RadiusOption = None,
-    frame_interval: IntervalOption = None,
-    bounds: BoundsOption = None,
-    periodic: PeriodicOption = None,
-    rescale: RescaleFlag = False,
-    input_frames: InputFramesOption = None,
-    horizon: HorizonOption = None,
-    frames_of_interest: InterestOption = None,
-    cells: CellsOption = None,
-    full_box: FullBoxFlag = None,
+    radius: float | None = None,
+    frame_interval: float | None = None,
+    spacing: float | None = None,
+    bounds: str | None = None,
+    periodic: str | None = None,
+    rescale: bool = True,
+    input_frames: int | None = None,
+    horizon: int | None = None,
+    full_box: Annotated[bool | None, Parameter(negative="--free-surface")] = None,
+    valid: int | None = None,
+    test: int | None = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Make a local split from the data of another code base.
+    """Make a local split from trajectories of other programs or code bases.
 
     You train and score models on a local split as on any other split.
 
     Args:
-        source: Folder of train, valid, test and metadata.
+        sources: Files or folders of trajectories, or a folder of train, valid and test.
         output: New folder; its last part is the split's name.
-        file_format: gns-npz or lagrangebench-h5; by default the one whose files the
-            folder holds.
+        axes: Axes of arrays without names, as in particle,frame,space; by default
+            frame,particle,space.
+        positions: Name of the positions; in HDF5 GROUP/NAME, where * is any name.
         kinds: Material of each particle kind, as in 3=jelly; 0=drop leaves out kind 0.
+        radius: Connectivity radius of graph models; two spacings by default.
+        frame_interval: Time between two frames [s], where the files do not state it.
+        spacing: Distance of neighbouring particles at first; measured by default.
+        bounds: Lowest and highest position of the box along each axis, as in 0,2,0,1.
+        periodic: Axes along which the box is periodic, as in x,y; or none.
+        rescale: Scale positions by a power of two where they do not fit the unit box.
+        input_frames: Frames that a model is given; 6 by default.
+        horizon: Frames to predict; by default all after the given ones.
+        full_box: Whether material fills the box. Then the error of the vorticity ranks,
+            else the distance of particle clouds.
+        valid: Trajectories for valid; by default a tenth, and at least one.
+        test: Trajectories for test; by default a tenth, and at least six; of fewer than
+            18 trajectories a third, and at least one.
     """
-    options = _data_options(locals())
-    with progress_bar(quiet=quiet) as progress:
-        local_split = import_split(
-            source,
-            format=file_format,
-            output=output,
-            kinds=parse_kinds(kinds),
-            progress=progress,
-            **options,
-        )
-    _print_local_split(local_split, as_json=as_json, quiet=quiet)
-
-
-def adopt_command(
-    sources: list[Path],
-    /,
-    *,
-    output: OutputOption = None,
-    describe: DescribeOption = None,
-    radius: RadiusOption = None,
-    frame_interval: IntervalOption = None,
-    valid: int | None = None,
-    test: int | None = None,
-    bounds: BoundsOption = None,
-    periodic: PeriodicOption = None,
-    rescale: RescaleFlag = False,
-    input_frames: InputFramesOption = None,
-    horizon: HorizonOption = None,
-    frames_of_interest: InterestOption = None,
-    cells: CellsOption = None,
-    full_box: FullBoxFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-) -> None:
-    """Make a local split from your own trajectories.
-
-    The trajectories are NumPy arrays or netCDF files.
-
-    Args:
-        sources: .npy, .npz or .nc files, or a folder of them.
-        output: New folder; its last part is the split's name.
-        valid: Number of trajectories for valid; by default a tenth, and at least one.
-        test: Number of trajectories for test; by default a tenth, and at least six; of
-            fewer than 18 trajectories a third, and at least one.
-    """
-    options = _data_options(locals())
+    options = {
+        "radius": radius,
+        "frame_interval": frame_interval,
+        "spacing": spacing,
+        "bounds": _parse_bounds(bounds),
+        "periodic": None if periodic is None else _parse_axes(periodic),
+        "rescale": rescale,
+        "input_frames": input_frames,
+        "horizon": horizon,
+        "full_box": full_box,
+    }
     with progress_bar(quiet=quiet) as progress:
         local_split = adopt(
             sources,
             output=output,
+            axes=axes or (),
+            positions=positions,
+            kinds=kinds,
             valid=valid,
             test=test,
             progress=progress,
-            **options,
+            **{name: value for name, value in options.items() if value is not None},
         )
     _print_local_split(local_split, as_json=as_json, quiet=quiet)
 
 
-def _data_options(parameters: Mapping[str, Any]) -> Any:  # noqa: ANN401 (a DataOptions)
-    """Return the options that describe the data, those of ``--describe`` included."""
-    options: dict[str, Any] = {}
-    for name in DataOptions.__annotations__:
-        value = parameters.get(name)
-        if value is not None:
-            options[name] = value
-    # A flag that the user leaves out must not win over the file.
-    if not options["rescale"]:
-        del options["rescale"]
-    if "bounds" in options:
-        options["bounds"] = _parse_bounds(options["bounds"])
-    if "periodic" in options:
-        options["periodic"] = _parse_axes(options["periodic"])
-    if "frames_of_interest" in options:
-        options["frames_of_interest"] = parse_ids(
-            options["frames_of_interest"], where="--frames-of-interest", noun="frame"
-        )
-    if parameters["describe"] is None:
-        return options
-    return {**read_options(parameters["describe"]), **options}
-
-
-def _parse_bounds(text: str) -> tuple[tuple[float, float], ...]:
+def _parse_bounds(text: str | None) -> list[list[float]] | None:
     """Return the lowest and the highest position along each axis."""
+    if text is None:
+        return None
     try:
         ends = [float(part) for part in text.split(",")]
         if len(ends) not in (4, 6):
             raise ValueError
     except ValueError:
         raise UsageError(
-            "bad bounds",
-            where="--bounds",
-            expected="x0,x1,y0,y1, as in 0,2,0,1; and z0,z1 in three dimensions",
-            got=ascii(text),
-            fix="give the lowest and the highest position along each axis, with commas "
-            "and without blanks",
+            f"--bounds: {text!r} has another form; give x0,x1,y0,y1 (and z0,z1), as in "
+            "--bounds 0,2,0,1"
         ) from None
-    return tuple(zip(ends[::2], ends[1::2], strict=True))
+    return [ends[start : start + 2] for start in range(0, len(ends), 2)]
 
 
 def _parse_axes(text: str) -> tuple[str, ...]:

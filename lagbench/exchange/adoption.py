@@ -1,532 +1,529 @@
-"""Trajectories from elsewhere in, a hashed local split out."""
+"""Trajectories from elsewhere in, a hashed local split out: the one door."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
-import h5py
 import numpy as np
+import xarray as xr
+from pydantic import ValidationError
 
+from lagbench.data.box import AXES, Box
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
-from lagbench.data.hdf5 import hdf5_errors, open_hdf5
+from lagbench.data.judgement import Judgement, find_shared_frames, judge_trajectory
 from lagbench.data.layout import expand_home
-from lagbench.data.structure import Structure, check_structure
-from lagbench.errors import (
-    UnreadableFileError,
-    UsageError,
-    UsageErrorCollector,
-    format_count,
-)
+from lagbench.errors import DataError, UsageError
 from lagbench.metrics.significance import FEWEST_SCENARIOS
-from lagbench.work.run import Progress
+from lagbench.work.run import Meter, Progress
 
-from . import gns_npz
-from .array_files import Row, list_trajectories, open_trajectory, sort_naturally
-from .axis_order import parse_order
 from .local_split import (
+    Description,
     LocalSplit,
     check_output,
-    find_bounds,
-    format_bounds,
-    make_local_split,
-    output_name,
+    write_local_split,
 )
-from .metadata import (
-    DROP,
-    ENDINGS,
-    FORCE,
-    Format,
-    SourceMetadata,
-    find_materials,
-    parse_format,
-    read_metadata,
-)
-from .trajectory import (
-    DataOptions,
-    Description,
-    Frame,
-    Trajectory,
-    check_array,
-    check_options,
-)
+from .names import Trajectory, name_trajectory, parse_kinds
+from .readers import Listing, Options, Source, list_sources, read_metadata
+from .spacing import ball_volume, estimate_spacing
 
-NEEDED_OPTIONS = {
-    "radius": "the connectivity radius of graph models, in the length of the data",
-    "frame_interval": "the time between two frames [s]",
-}
-"""Options without which nothing is adopted, and their meanings."""
+RADIUS = 2.0
+"""Connectivity radius where none is stated [spacing]."""
 
-MOST_TRAJECTORIES = 100_000
-"""Most trajectories of an HDF5 file that are looked at."""
+SPACING_RATIO = 1.5
+"""Ratio of the stated spacing and the measured one, or its inverse, at most."""
+
+FEWEST_NEIGHBOURS = 3.0
+MOST_NEIGHBOURS = 100.0
+"""Neighbours within the radius between which nothing is said."""
+
+SMALL_SHARE = 0.1
+"""Extent of all positions over the box, along every axis, that needs no note."""
+
+Data = str | Path | xr.Dataset
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """A trajectory that was looked at once, and how it is opened again."""
+
+    open: Callable[[], Trajectory]
+    judgement: Judgement
+    spacing: float | None  # measured in the first frame [length]; None for one particle
+    interval: float | None  # time between two frames that the file states [s]
+    particles: int
+    axes: tuple[int, ...]  # components that are not constant
+    stated: Mapping[str, Any]  # options that the file states
 
 
 def adopt(
-    sources: str | Path | Sequence[str | Path],
+    sources: Data | Sequence[Data],
     *,
-    output: str | Path | None = None,
+    output: str | Path,
+    axes: Sequence[str] | str = (),
+    positions: str | None = None,
+    kinds: Mapping[Any, str] | str | None = None,
     valid: int | None = None,
     test: int | None = None,
     progress: Callable[[Progress], None] | None = None,
-    **options: Unpack[DataOptions],
+    **options: Any,  # noqa: ANN401 (fields of a Description)
 ) -> LocalSplit:
-    """Make a local split of trajectories in .npy, .npz or netCDF files.
+    """Make a local split of trajectories; nothing about them is guessed.
 
-    A .npy file holds positions [frame, particle, axis], or several trajectories
-    [trajectory, frame, particle, axis], in two or three dimensions; .npz and netCDF
-    files hold ``position`` and, if they like, ``velocity`` of the same shape,
-    ``material`` [particle] (0 liquid, 1 jelly, 2 snow, 3 rope; liquid when absent) and
-    ``wall_velocity`` [wall, axis] or [frame, wall, axis] (left, right, bottom, top,
-    and front, back in three dimensions). Trajectories may differ in their numbers of
-    frames and of particles. Nothing is unpickled.
+    A dataset has the dimensions time, particle and space and the variable ``position``;
+    where it has them, ``velocity`` of the same shape, ``time`` [s, or its unit],
+    ``material`` [particle] (0 liquid, 1 jelly, 2 snow, 3 rope), ``id`` [particle] or
+    [time, particle], which orders the rows, and ``wall_velocity`` [wall, axis] or
+    [time, wall, axis]. docs/exchange.md has the formats.
 
     Args:
-        sources: a folder with subfolders ``train``, ``valid`` and ``test``; or files,
-            or a folder of files, which are sorted by name and of which the last are
-            taken for test, those before for valid.
-        output: folder to make, which must be given; its last part is the name of the
-            split.
+        sources: a folder with subfolders, or files, ``train``, ``valid`` and ``test``;
+            or files, folders and datasets of which the last are taken for test, those
+            before for valid.
+        output: folder to make; its last part is the name of the split.
+        axes: order of the axes of arrays without names, of "trajectory", "frame",
+            "particle" and "space"; frame, particle, space when empty.
+        positions: name of the positions, in HDF5 their path.
+        kinds: material, or "drop", of each kind of particles, as in "3=jelly,0=drop".
         valid: trajectories for valid; a tenth, at least one, when None.
         test: trajectories for test; when None a tenth, at least six (with fewer no
             p-value can reach 5 %), at most a third.
         progress: called as the work advances.
-        **options: ``radius`` and ``frame_interval``, which must be given; ``axes``, the
-            order of the axes of arrays, as in ("particle", "frame", "space"); and what
-            else is known, see :class:`lagbench.exchange.trajectory.Description`. With
-            ``rescale`` and without ``bounds``, the extent of all positions is the box.
+        **options: what else is known, see
+            :class:`lagbench.exchange.local_split.Description`.
 
     Raises:
-        UsageError: no radius or frame interval, too few trajectories or one named
-            twice, an output folder that exists already, a task that does not fit the
-            data, a period that the positions contradict. One message names everything
-            that is missing.
-        UnreadableFileError: a file is damaged, pickled, or holds no positions.
-        DataError: positions are not finite, or outside the unit box, or
-            particles jump by more than half the box along an axis with walls.
+        UsageError: something is not known, or contradicts the data.
+        UnreadableFileError: a file is damaged, or of no format that is read.
+        DataError: the positions are no trajectories, see
+            :mod:`lagbench.data.judgement`.
         WorkFailedError: the disk is full or not writable.
     """
-    options = check_options(options)
-    if isinstance(sources, str | Path):
-        paths = [expand_home(sources, "sources")]
-    else:
-        paths = [expand_home(source, "sources") for source in sources]
+    folder = check_output(output)
+    if isinstance(axes, str):
+        axes = axes.split(",")
+    axes = [axis.strip().replace("time", "frame") for axis in axes]
+    if set(axes) - {"trajectory", "frame", "particle", "space"}:
+        raise UsageError(
+            f"--axes: {', '.join(axes)} are not all known; name trajectory, frame, "
+            "particle and space in their order, as in frame,particle,space"
+        )
+    reading = Options(axes=axes, positions=positions)
+    if isinstance(sources, str | Path | xr.Dataset):
+        sources = [sources]
+    listings, stated, text = _list_subsets(sources, reading, valid=valid, test=test)
+    description = _describe({**stated, **options})
+    counts = {subset: len(listing.sources) for subset, listing in listings.items()}
+    total = sum(counts.values())
 
-    rows_of: Mapping[str, list[Row]] = {}
-    mistakes = UsageErrorCollector()
-    for name, meaning in NEEDED_OPTIONS.items():
-        with mistakes:
-            _require_option(options, name, meaning)
-    folder = Path()
-    with mistakes:
-        folder = check_output(output)
-    stated_order = None
-    if "axes" in options:
-        with mistakes:
-            stated_order = parse_order(options["axes"])
-    with mistakes:
-        rows_of = _divide_into_subsets(paths, valid=valid, test=test)
-    mistakes.raise_errors()
-    _refuse_duplicates(list(chain(*rows_of.values())))
+    meter = Meter(progress)
+    meter.begin("judging", total=total, scenarios=total)
+    judged: dict[str, list[_Judged]] = {}
+    notes: list[str] = []
+    for subset, listing in listings.items():
+        notes += [f"not read: {', '.join(listing.skipped)}"] if listing.skipped else []
+        judged[subset] = []
+        for source in listing.sources:
+            judged[subset].append(
+                _judge(source, description, parse_kinds(kinds), notes)
+            )
+            meter.count(1, scenarios=1)
+    judgements = {}
+    for subset, members in judged.items():
+        judgements[subset] = [member.judgement for member in members]
+    notes = _shorten(notes)
+    notes += find_shared_frames(judgements)
+    description, box, more_notes = _complete(description, judged)
+    notes += more_notes
 
-    open_row = partial(open_trajectory, order=stated_order)
-    counts = {}
-    subsets = {}
-    for subset, rows in rows_of.items():
-        counts[subset] = len(rows)
-        subsets[subset] = map(open_row, rows)
-    stated_fields: dict[str, Any] = {**options}
-    stated_fields.pop("axes", None)
-    needs_bounds = options.get("rescale") and not options.get("periodic")
-    if needs_bounds and "bounds" not in options:
-        stated_fields["bounds"] = find_bounds(map(open_row, chain(*rows_of.values())))
-    description = Description(
-        name=folder.name,
-        source=f"{sum(counts.values())} trajectories of the user's own",
-        **stated_fields,
-    )
-    local_split = make_local_split(
-        description,
-        subsets,
+    trajectories = {}
+    for subset, members in judged.items():
+        trajectories[subset] = [
+            (member.open, description.spacing or member.spacing or description.radius)
+            for member in members
+        ]
+    meter.begin("writing", total=total, scenarios=total)
+    local_split = write_local_split(
         folder,
-        command="adopt",
-        counts=counts,
-        progress=progress,
+        description,
+        box,
+        trajectories,
+        source=text or f"{total} trajectories of the user's own",
+        count=partial(meter.count, 1, scenarios=1),
     )
-    notes = list(local_split.notes)
-    if "bounds" not in options:
-        walls = format_bounds(local_split.bounds)
+    if counts["test"] < FEWEST_SCENARIOS:
         notes.append(
-            f"no bounds are stated, so the walls are {walls}, the smallest box around "
-            "all positions. Models and scores use these walls; --bounds states the "
-            "true ones"
+            f"{counts['test']} trajectories for test: under {FEWEST_SCENARIOS} no "
+            "difference between methods can be significant; --test puts more there"
         )
     return replace(local_split, notes=tuple(notes))
 
 
-def _require_option(options: DataOptions, name: str, meaning: str) -> None:
-    """Refuse to go on without an option that no data state."""
-    if name in options:
-        return
-    words = name.replace("_", " ")
-    option = name.replace("_", "-")
-    raise UsageError(
-        f"the {words} is not known",
-        where=f"--{option}",
-        expected=meaning,
-        got="nothing",
-        fix=f"add --{option} NUMBER, or the key {name} of a --describe file",
-    )
-
-
-def _divide_into_subsets(
-    paths: Sequence[Path], *, valid: int | None, test: int | None
-) -> Mapping[str, list[Row]]:
-    """Return the trajectories of each subset."""
-    if len(paths) == 1 and (paths[0] / HASHED_SUBSETS[0]).is_dir():
-        if valid is not None or test is not None:
-            raise UsageError(
-                "the folders train, valid and test decide the subsets",
-                where="--valid and --test",
-                expected="no such option beside the folders train, valid and test",
-                got=f"--valid {valid}, --test {test}",
-                fix="leave them out, or name the files",
-            )
-        return {
-            subset: list_trajectories(paths[0] / subset) for subset in HASHED_SUBSETS
-        }
-
-    # A shell lists run10 before run2; an order that is not the shell's is the user's
-    # own.
-    if list(paths) == sorted(paths):
-        paths = sort_naturally(paths)
-    rows = []
-    for path in paths:
-        rows += list_trajectories(path)
-    _require_one("--valid", valid)
-    _require_one("--test", test)
-    valid_count, test_count = _count_held_out(len(rows), valid=valid, test=test)
-    train_count = len(rows) - valid_count - test_count
-    if train_count < 1:
-        fewest = _fewest_trajectories(valid=valid, test=test)
-        raise UsageError(
-            "each subset needs a trajectory",
-            where="--valid and --test",
-            expected=f"at least {fewest} trajectories, so that one is left for train",
-            got=f"{format_count(len(rows), 'trajectory')}, {valid_count} for valid, "
-            f"{test_count} for test",
-            fix="name more files, or a .npy of shape [trajectory, frame, particle, "
-            "axis]; or ask for fewer with --valid and --test",
-        )
-    first_test = train_count + valid_count
-    return {
-        "train": rows[:train_count],
-        "valid": rows[train_count:first_test],
-        "test": rows[first_test:],
-    }
-
-
-def _require_one(option: str, count: int | None) -> None:
-    """Refuse a stated subset without trajectories."""
-    if count is None or count >= 1:
-        return
-    raise UsageError(
-        "each subset needs a trajectory",
-        where=option,
-        expected="at least 1",
-        got=count,
-        fix="give a larger number, or leave the option out",
-    )
-
-
-def _count_held_out(
-    total: int, *, valid: int | None, test: int | None
-) -> tuple[int, int]:
-    """Return the numbers of trajectories for valid and test; train has the others."""
-    if valid is None:
-        valid = max(1, total // 10)
-    if test is None:
-        # enough for a p-value, but no more than train can spare
-        test = max(1, total // 10, min(FEWEST_SCENARIOS, total // 3))
-    return valid, test
-
-
-def _fewest_trajectories(*, valid: int | None, test: int | None) -> int:
-    """Return the fewest trajectories of which one is left for train."""
-    fewest = 1
-    while True:
-        held_out_count = sum(_count_held_out(fewest, valid=valid, test=test))
-        if held_out_count < fewest:
-            return fewest
-        # With more trajectories no fewer are held out, so the result is no smaller.
-        fewest = held_out_count + 1
-
-
-def _refuse_duplicates(rows: Sequence[Row]) -> None:
-    """Refuse a trajectory that is named twice, also by links.
-
-    It could be trained on and tested.
-    """
-    path_of: dict[Row, Path] = {}
-    for path, number in rows:
-        row = (path.resolve(), number)
-        if row in path_of:
-            raise UsageError(
-                "a file is named twice",
-                where=str(path),
-                expected="each once",
-                got=f"{path_of[row]} before",
-                fix="name it once; otherwise models could be trained and tested on it",
-            )
-        path_of[row] = path
-
-
-def import_split(
-    source: str | Path,
+def _list_subsets(
+    sources: Sequence[Data],
+    reading: Options,
     *,
-    output: str | Path,
-    format: str | None = None,
-    kinds: Mapping[int, str] | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    **options: Unpack[DataOptions],
-) -> LocalSplit:
-    """Make a local split of train, valid and test in another code base's format.
-
-    Positions are taken over as they are, as float32; velocities are their differences
-    over the frame interval. No pickle is run. A ``force.py`` beside the data is not
-    read; a note says so.
-
-    Args:
-        source: folder of the three files and metadata.json.
-        output: folder to make; its last part is the name of the split.
-        format: "gns-npz" or "lagrangebench-h5"; by default the one whose files the
-            folder holds.
-        kinds: number of a kind of particles to the material that it stands for, or to
-            "drop".
-        progress: called as the work advances.
-        **options: what shall hold instead of what the metadata say, see
-            :class:`lagbench.exchange.trajectory.Description`.
-
-    Raises:
-        UsageError: unknown format, a folder whose files are of no format or of both
-            and none is named, an output folder that is there, a task that does not fit
-            the data, a period that the positions contradict.
-        UnreadableFileError: a file is missing, damaged or laid out otherwise, holds a
-            pickle of more than arrays, or particles of a kind that no material is
-            known for.
-        DataError: positions are not finite, or outside the unit box, or
-            particles jump by more than half the box along an axis with walls.
-        WorkFailedError: the disk is full or not writable.
-    """
-    options = check_options(options)
-    if "axes" in options:
-        raise UsageError(
-            "the format itself states the order of the axes",
-            where="axes",
-            expected="no such key",
-            got="axes",
-            fix="leave it out; adopt takes it",
-        )
-    folder = expand_home(source, "source")
-    if not folder.is_dir():
-        raise UnreadableFileError(
-            "there is no such folder",
-            where=str(folder),
-            expected="a folder of train, valid, test and metadata.json",
-            got="a file" if folder.exists() else "nothing",
-            fix="name the folder of the data",
-        )
-    if format is None:
-        form = _recognise_format(folder)
-    else:
-        form = parse_format(format)
-    names = _file_names(form)
-    _require_files(folder, names)
-    metadata = read_metadata(folder, form)
-    digests = [f"{name} {file_sha256(folder / name)[:16]}" for name in names]
-    description = Description(
-        name=output_name(output),
-        source=f"{form.value}: {', '.join(digests)}",
-        **_description_options(metadata, options),
-    )
-
-    user_kinds = dict.fromkeys(metadata.lagbench.wall_particle_type, DROP)
-    user_kinds.update(kinds or {})
-    read = gns_npz.read_trajectories
-    if form is Format.LAGRANGEBENCH_H5:
-        read = partial(_read_h5, metadata=metadata)
-    subsets = {}
-    for subset, name in zip(HASHED_SUBSETS, names, strict=True):
-        subsets[subset] = read(folder / name, user_kinds)
-    local_split = make_local_split(
-        description, subsets, output, command="import", progress=progress
-    )
-    if not (folder / FORCE).is_file():
-        return local_split
-    note = f"{FORCE} is a program and is not read: the split has no body force"
-    return replace(local_split, notes=(*local_split.notes, note))
-
-
-def _file_names(form: Format) -> list[str]:
-    """Return the names of train, valid and test in a format."""
-    return [f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS]
-
-
-def _missing_files(folder: Path, names: Sequence[str]) -> list[str]:
-    return [name for name in names if not (folder / name).is_file()]
-
-
-def _recognise_format(folder: Path) -> Format:
-    """Return the format whose files a folder holds; refuse none, and several.
-
-    A format with all three files wins over one of which files are missing.
-    """
-    whole_formats = []
-    begun_formats = []
-    layouts = []
-    for form in Format:
-        names = _file_names(form)
-        layouts.append(f"{', '.join(names)} ({form.value})")
-        missing_count = len(_missing_files(folder, names))
-        if missing_count == 0:
-            whole_formats.append(form)
-        elif missing_count < len(names):
-            begun_formats.append(form)
-    formats = whole_formats or begun_formats
-    if len(formats) == 1:
-        return formats[0]
-    if formats:
-        got = "files of both formats"
-        fix = f"name one: --format {formats[0].value}"
-    else:
-        got = "no such files"
-        fix = "name their folder; `lagbench adopt` takes other files"
-    raise UsageError(
-        "the format of the data is not clear",
-        where=str(folder),
-        expected=" or ".join(layouts),
-        got=got,
-        fix=fix,
-    )
-
-
-def _require_files(folder: Path, names: Sequence[str]) -> None:
-    """Refuse a folder without the files of a format; name the format that it has."""
-    missing = _missing_files(folder, names)
-    if not missing:
-        return
-    fix = None
-    for form in Format:
-        form_names = _file_names(form)
-        if not _missing_files(folder, form_names):
-            fix = f"the folder holds {form_names[0]}: --format {form.value}"
-    raise UnreadableFileError(
-        "files are missing",
-        where=str(folder),
-        expected=", ".join(names),
-        got=f"no {', no '.join(missing)}",
-        fix=fix or "name their folder; `lagbench adopt` takes other files",
-    )
-
-
-def _description_options(
-    metadata: SourceMetadata, options: DataOptions
-) -> dict[str, Any]:
-    """Return the keywords of a ``Description``, without its name and source.
-
-    The user's options win over what our own exports add (``metadata.lagbench``), which
-    wins over the rest of the metadata.
-
-    Raises:
-        UsageError: nothing states the time between frames.
-    """
-    keys = metadata.lagbench
-    if "input_frames" in options or "horizon" in options:
-        # The frames of interest belong to the exported task.
-        keys = keys.model_copy(update={"frames_of_interest": None})
-    merged: dict[str, Any] = metadata.model_dump(
-        exclude={"periodic", "lagbench"}, exclude_none=True
-    )
-    merged |= keys.model_dump(
-        exclude={"origin", "placement", "wall_particle_type"}, exclude_none=True
-    )
-    merged["periodic"] = metadata.periodic_axes
-    merged["full_box"] = keys.placement == "cell_centres"
-    merged |= options
-    if "frame_interval" not in merged:
-        raise UsageError(
-            "the metadata state no time between frames",
-            where="metadata.json",
-            expected="dt",
-            got="none",
-            fix="state it: --frame-interval SECONDS",
-        )
-    return merged
-
-
-def _read_h5(
-    path: Path, kinds: Mapping[int, str], metadata: SourceMetadata
-) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file of LagrangeBench."""
-    with open_hdf5(path) as file:
-        # A stranger's file shall read none of ours, and hold no more than it shows.
-        structure = Structure(members=MOST_TRAJECTORIES, groups=None)
-        check_structure(file, path, structure)
-        for key in sorted(file):
-            name = f"{path}, group {key!r}"
-            with hdf5_errors(path):
-                trajectory = _parse_group(
-                    path, file[key], name=name, kinds=kinds, metadata=metadata
+    valid: int | None,
+    test: int | None,
+) -> tuple[dict[str, Listing], dict[str, Any], str]:
+    """Return the trajectories of each subset, what metadata state, and their source."""
+    first = sources[0]
+    if len(sources) == 1 and not isinstance(first, xr.Dataset):
+        folder = expand_home(first, "sources")
+        parts = {}
+        for subset in HASHED_SUBSETS:
+            candidates = [folder / subset, *folder.glob(f"{subset}.*")]
+            parts[subset] = [path for path in candidates if path.exists()]
+        if all(parts.values()):
+            several = [paths for paths in parts.values() if len(paths) > 1]
+            if several or valid is not None or test is not None:
+                raise UsageError(
+                    f"{folder}: train, valid and test decide the subsets; leave "
+                    "--valid and --test out, and keep one file or folder of each name"
                 )
-            yield trajectory
+            listings = {}
+            digests = []
+            for subset, (path,) in parts.items():
+                listings[subset] = list_sources(path, reading)
+                if path.is_file():
+                    digests.append(f"{path.name} {file_sha256(path)[:16]}")
+            if (folder / "force.py").is_file():
+                listings["train"].skipped.append("force.py, a program")
+            return listings, read_metadata(folder), ", ".join(digests)
 
-
-def _parse_group(
-    path: Path,
-    group: h5py.Group,
-    *,
-    name: str,
-    kinds: Mapping[int, str],
-    metadata: SourceMetadata,
-) -> Trajectory:
-    members = set()
-    if not isinstance(group, h5py.Dataset):
-        members = set(group)
-    if not {"position", "particle_type"} <= members:
-        raise UnreadableFileError(
-            "this is no trajectory",
-            where=name,
-            expected="position and particle_type",
-            got=", ".join(sorted(members)[:10]) or "no members",
-            fix="export it again as LagrangeBench writes it, or use lagbench adopt",
+    found: list[Source] = []
+    skipped: list[str] = []
+    for source in sources:
+        if isinstance(source, xr.Dataset):
+            name = f"dataset {len(found)}"
+            found += _sources_of_dataset(source, name)
+            continue
+        listing = list_sources(expand_home(source, "sources"), reading)
+        found += listing.sources
+        skipped += listing.skipped
+    total = len(found)
+    valid_count = max(1, total // 10) if valid is None else valid
+    test_count = test
+    if test_count is None:
+        # enough for a p-value, but no more than train can spare
+        test_count = max(1, total // 10, min(FEWEST_SCENARIOS, total // 3))
+    train_count = total - valid_count - test_count
+    if min(train_count, valid_count, test_count) < 1:
+        raise UsageError(
+            f"{total} trajectories, {valid_count} for valid and {test_count} for test, "
+            "leave none for one of train, valid and test; give three or more, and "
+            "--valid and --test from 1"
         )
-    position = group["position"]
-    shape = position.shape
-    check_array(name, shape, position.dtype)
-    material, is_kept = find_materials(
-        Format.LAGRANGEBENCH_H5,
-        np.asarray(group["particle_type"]),
-        shape[1],
-        user_kinds=kinds,
-        where=name,
-    )
-    origin = np.asarray(metadata.lagbench.origin, np.float32)[: shape[2]]
+    ends = (0, train_count, train_count + valid_count, total)
+    listings = {}
+    for number, subset in enumerate(HASHED_SUBSETS):
+        members = found[ends[number] : ends[number + 1]]
+        listings[subset] = Listing(sources=members)
+    listings["train"].skipped.extend(skipped)
+    return listings, {}, ""
 
-    def read() -> Iterator[Frame]:
-        for number in range(shape[0]):
-            with hdf5_errors(path, f"{position.name}, frame {number}"):
-                frame = position[number][is_kept]
-            if origin.any():
-                frame = frame + origin
-            yield frame, None
 
-    return Trajectory(
-        name=name,
-        frames=shape[0],
-        material=material,
-        read=read,
-        dimension=shape[2],
+def _sources_of_dataset(dataset: xr.Dataset, name: str) -> Iterator[Source]:
+    if "trajectory" not in dataset.dims:
+        yield Source(name=name, open=dataset.copy)
+        return
+    for number in range(dataset.sizes["trajectory"]):
+        one = dataset.isel(trajectory=number)
+        yield Source(name=f"{name}, trajectory {number}", open=one.copy)
+
+
+def _describe(options: Mapping[str, Any]) -> Description:
+    """Return checked options; values of NumPy become those of Python."""
+    plain = {}
+    for name, value in options.items():
+        if isinstance(value, np.ndarray | np.generic):
+            value = value.tolist()
+        if value is not None:
+            plain[name] = value
+    try:
+        return Description.model_validate(plain)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        known = ""
+        if first["type"] == "extra_forbidden":
+            known = f"; known are {', '.join(Description.model_fields)}"
+        raise UsageError(
+            f"{name}: {first['msg']} (got {first['input']!r}); correct it{known}"
+        ) from error
+
+
+def _judge(
+    source: Source,
+    description: Description,
+    kinds: Mapping[str, str],
+    notes: list[str],
+) -> _Judged:
+    """Read a trajectory once; refuse what is none, and note what a user should know."""
+
+    def open_trajectory() -> Trajectory:
+        dataset = source.open()
+        return _drop_constant_axes(name_trajectory(dataset, source.name, kinds))
+
+    trajectory = open_trajectory()
+    name = trajectory.name
+    notes += trajectory.notes
+    interval = description.frame_interval or trajectory.interval
+    if interval is None:
+        raise UsageError(
+            f"{name} does not state the time between two frames; add --frame-interval "
+            "SECONDS"
+        )
+    if trajectory.interval and abs(trajectory.interval / interval - 1.0) > 0.01:
+        raise UsageError(
+            f"{name}: frames are {trajectory.interval:.6g} s apart by the times in the "
+            f"file, and --frame-interval is {interval:.6g} s; leave the option out, or "
+            "correct the file"
+        )
+    stated = _select_axes(_with_file_box(description, trajectory), trajectory)
+    with trajectory.dataset:
+        judgement = judge_trajectory(
+            name, trajectory.read(), box=stated.box, frame_interval=interval
+        )
+        first_frame, _ = next(trajectory.read())
+    box = stated.box or _box_around([judgement])
+    notes += judgement.notes
+    return _Judged(
+        open=open_trajectory,
+        judgement=judgement,
+        spacing=estimate_spacing(first_frame, box, where=f"{name}, frame 0"),
+        interval=trajectory.interval,
+        particles=len(trajectory.material),
+        axes=trajectory.axes,
+        stated={"bounds": stated.bounds, "periodic": stated.periodic},
     )
+
+
+def _drop_constant_axes(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory without components that are the same everywhere.
+
+    Two-dimensional data in formats of three dimensions have one.
+    """
+    dataset = trajectory.dataset
+    last = trajectory.frames - 1
+    position = dataset["position"].isel(time=[0, last // 2, last]).values
+    lows = position.min(axis=(0, 1))
+    is_constant = lows == position.max(axis=(0, 1))
+    kept = np.flatnonzero(~is_constant)
+    if len(kept) == len(lows) or position.shape[1] == 1:
+        return replace(trajectory, axes=tuple(range(len(lows))))
+    names = [AXES[axis] for axis in np.flatnonzero(is_constant)]
+    text = (
+        f"{trajectory.name}: {' and '.join(names)} is {lows[is_constant][0]:g} for all "
+        "particles in all frames"
+    )
+    if len(kept) < 2:
+        raise DataError(f"{text}; a trajectory has two or three dimensions")
+    note = f"{text}: it is left out, and the data have two dimensions, "
+    note += " and ".join(AXES[axis] for axis in kept)
+    return replace(
+        trajectory,
+        dataset=dataset.isel(space=kept),
+        axes=tuple(kept.tolist()),
+        notes=(*trajectory.notes, note),
+    )
+
+
+def _with_file_box(description: Description, trajectory: Trajectory) -> Description:
+    """Return a description with the box of the file where the user states none."""
+    if description.bounds is not None or not trajectory.stated.get("periodic"):
+        return description
+    return _describe({**description.model_dump(), **trajectory.stated})
+
+
+def _select_axes(description: Description, trajectory: Trajectory) -> Description:
+    """Return a description whose bounds and periodic axes are those that are kept."""
+    axes = trajectory.axes
+    bounds = description.bounds
+    if bounds is None or len(bounds) == len(axes):
+        return description
+    if len(bounds) < len(axes):
+        raise UsageError(
+            f"{trajectory.name} has {len(axes)} components, and --bounds has "
+            f"{len(bounds)} pairs; give a pair for each"
+        )
+    periodic = []
+    for number, axis in enumerate(axes):
+        if AXES[axis] in description.periodic:
+            periodic.append(AXES[number])
+    return description.model_copy(
+        update={
+            "bounds": tuple(bounds[axis] for axis in axes),
+            "periodic": tuple(periodic),
+        }
+    )
+
+
+def _box_around(judgements: Sequence[Judgement]) -> Box:
+    """Return the smallest box that holds all positions."""
+    low = np.min([judgement.low for judgement in judgements], axis=0)
+    high = np.max([judgement.high for judgement in judgements], axis=0)
+    return Box.from_bounds(np.stack([low, high], axis=1).tolist())
+
+
+def _complete(
+    description: Description, judged: Mapping[str, Sequence[_Judged]]
+) -> tuple[Description, Box, list[str]]:
+    """Return a description without gaps, the box, and notes on both.
+
+    Raises:
+        UsageError: what is stated contradicts the data, or trajectories differ in what
+            a split has once.
+    """
+    members = [member for many in judged.values() for member in many]
+    first = members[0]
+    for member in members:
+        for quantity in ("axes", "interval", "stated"):
+            value = getattr(member, quantity)
+            if value != getattr(first, quantity) and quantity != "interval":
+                raise UsageError(
+                    f"{first.judgement.name} and {member.judgement.name} differ in "
+                    f"{'the box' if quantity == 'stated' else 'their dimensions'}: "
+                    f"{getattr(first, quantity)} and {value}; import them apart"
+                )
+        known = (first.interval, member.interval)
+        if None not in known and abs(known[0] / known[1] - 1.0) > 0.01:
+            raise UsageError(
+                f"{first.judgement.name} and {member.judgement.name} have frames "
+                f"{known[0]:.6g} and {known[1]:.6g} s apart; a split has one interval: "
+                "import them apart"
+            )
+    notes = []
+    judgements = [member.judgement for member in members]
+    extent = _box_around(judgements)
+    bounds = first.stated["bounds"]
+    periodic = first.stated["periodic"]
+    box = extent
+    if bounds is not None:
+        stated = description.model_copy(update={"bounds": bounds, "periodic": periodic})
+        box = stated.box or extent
+    else:
+        sides = " x ".join(f"[{low:.6g}, {high:.6g}]" for low, high in extent.bounds)
+        notes.append(
+            f"no bounds are stated, so the walls are {sides}, the smallest box around "
+            "all positions; --bounds states the true ones"
+        )
+    known_spacings = [member.spacing for member in members if member.spacing]
+    usual = description.spacing
+    if known_spacings:
+        measured = float(np.median(known_spacings))
+        usual = usual or measured
+        _check_spacing(description, known_spacings, notes)
+    _check_bounds(box, extent, judgements, usual or 0.0, notes)
+    radius = description.radius
+    if radius is None:
+        if usual is None:
+            raise UsageError("one particle has no spacing; add --radius LENGTH")
+        radius = float(f"{RADIUS * usual:.2g}")
+        notes.append(f"no radius is stated, so it is {radius:g}, about two spacings")
+    if radius > box.largest_radius * (1.0 + 1e-6):
+        raise UsageError(
+            f"the radius {radius:g} is above half of the shortest period, "
+            f"{box.largest_radius:g}; give a smaller --radius: two or three spacings"
+        )
+    if usual is not None:
+        neighbours = ball_volume(radius / usual, box.dimension)
+        most = max(member.particles for member in members)
+        if most > FEWEST_NEIGHBOURS and neighbours < FEWEST_NEIGHBOURS:
+            notes.append(
+                f"the radius {radius:g} holds {neighbours:.1g} neighbours: a graph "
+                f"model sees next to nothing; two spacings are {2.0 * usual:.2g}"
+            )
+        neighbours = min(neighbours, most - 1.0)
+        if neighbours > MOST_NEIGHBOURS:
+            notes.append(
+                f"the radius {radius:g} holds about {neighbours:.0f} neighbours, which "
+                f"make {neighbours * most:.2g} edges: a graph model may need more "
+                f"memory than there is; two spacings are {2.0 * usual:.2g}"
+            )
+    complete = description.model_copy(
+        update={
+            "radius": radius,
+            "frame_interval": description.frame_interval or first.interval,
+            "bounds": bounds,
+            "periodic": periodic,
+        }
+    )
+    return complete, box, notes
+
+
+def _check_spacing(
+    description: Description, measured: Sequence[float], notes: list[str]
+) -> None:
+    """Refuse a stated spacing that is not the measured one; note several ones."""
+    low = min(measured)
+    high = max(measured)
+    stated = description.spacing
+    if stated is None:
+        if high > 1.1 * low:
+            notes.append(
+                f"spacings of trajectories differ, from {low:.3g} to {high:.3g}: each "
+                "has the particle mass of its own"
+            )
+        return
+    usual = float(np.median(measured))
+    if max(stated / usual, usual / stated) > SPACING_RATIO:
+        raise UsageError(
+            f"the stated spacing is {stated:.4g}, and particles are {usual:.4g} apart "
+            "in the first frames; leave it out, or give it in the length of the data "
+            "(masses and the score grid rest on it)"
+        )
+
+
+def _check_bounds(
+    box: Box,
+    extent: Box,
+    judgements: Sequence[Judgement],
+    spacing: float,
+    notes: list[str],
+) -> None:
+    """Refuse particles outside the walls; note a box that is far too large."""
+    for judgement in judgements:
+        excess = np.maximum(box.lower_walls - judgement.low, 0.0)
+        excess = np.maximum(excess, judgement.high - box.upper_walls)
+        if excess.max() > spacing:
+            axis = AXES[int(np.argmax(excess))]
+            sides = np.stack([judgement.low, judgement.high], axis=1).round(6).tolist()
+            raise UsageError(
+                f"{judgement.name}: particles lie {excess.max():.3g} outside the "
+                f"bounds along {axis}; the trajectory fills {sides}: give --bounds "
+                "that hold it"
+            )
+    share = extent.lengths / box.lengths
+    if (share < SMALL_SHARE).all():
+        notes.append(
+            f"all positions lie in {share.max():.2g} of the box along each axis: are "
+            "--bounds in the length of the data?"
+        )
+
+
+def _shorten(notes: Sequence[str]) -> list[str]:
+    """Return notes of which those that trajectories share stand once.
+
+    A note begins with the name of the trajectory, and a colon.
+    """
+    names_of: dict[str, list[str]] = {}
+    for note in notes:
+        name, _, text = note.partition(": ")
+        names_of.setdefault(text or name, []).append(name)
+    lines = []
+    for text, names in names_of.items():
+        if text in names:
+            lines.append(text)
+        elif len(names) == 1:
+            lines.append(f"{names[0]}: {text}")
+        else:
+            lines.append(f"{names[0]} and {len(names) - 1} more: {text}")
+    return lines
+
+
+import_split = adopt
+"""The same function by the name of the command, ``lagbench import``."""

@@ -1,59 +1,46 @@
-"""Export a data set to formats of other code bases.
-
-Their models train on it unchanged.
-"""
+"""Export a data set to the formats of other code bases and of ParaView."""
 
 from __future__ import annotations
 
-import contextlib
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.atomic import atomic_path
+from lagbench.atomic import write_atomically
+from lagbench.data import MATERIALS
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.layout import expand_path
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
-from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.generators.constants import solver_constants
-from lagbench.make.inventory import has_all_statistics
 from lagbench.store.copy import scenario_files
 from lagbench.work.run import Meter, Progress
 
-from . import gns_npz
-from .metadata import (
-    ENDINGS,
-    FORCE,
-    NAME,
-    SHORT_NAMES,
-    WALL_NUMBERS,
-    ExportInfo,
-    Format,
-    describe_export,
-    material_numbers,
-    parse_format,
-    round_down,
-    write_metadata,
-)
-from .trajectory import Bounds, Run
+from . import gns_npz, lagrangebench_h5, vtkhdf
+
+FORMATS = {"gns-npz": ".npz", "lagrangebench-h5": ".h5", "vtkhdf": ".vtkhdf"}
+"""Formats, and the endings of their files."""
+
+FORCE = "force.py"
+"""A program beside the data that LagrangeBench runs."""
 
 WALL_LAYERS = 3
 """Layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them."""
 
-WALL_AXES = (1, 1, 0, 0)
+WALL_AXES = np.array([1, 1, 0, 0])
 """Axis along each wall: left, right, bottom, top."""
 
-LOW_WALLS = (0, 2)
-"""Left and bottom."""
+Run = tuple[NDArray[np.float32], NDArray[np.int64]]
+"""Positions [frame, particle, axis] and the kind of each particle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,16 +74,17 @@ def export(
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> ExportResult:
-    """Write train, valid and test of a data set, and metadata.json, in another format.
+    """Write train, valid and test of a data set in another format.
 
     One trajectory is in memory at a time. The same data give the same bytes with one
-    version of NumPy.
+    version of NumPy and of HDF5.
 
     Args:
         split: name of the split, or path of a local split's folder.
         size: name of the size; None takes the only one with data, or mini where several
             have data.
-        format: "gns-npz" or "lagrangebench-h5".
+        format: "gns-npz", "lagrangebench-h5", or "vtkhdf" with a file for each
+            scenario.
         output: folder for the files.
         root: folder of all data sets, see :func:`lagbench.data.local.resolve_root`.
         from_walls: lagrangebench-h5 only: measure positions from the lower walls, so
@@ -105,8 +93,8 @@ def export(
             program's neighbour search needs. None: from the walls in full boxes, and
             where walls may move or an axis is periodic.
         wall_particles: full boxes of two dimensions with four walls only: add
-            particles beside the walls that move along with them, since neither
-            format has wall velocities.
+            particles beside the walls that move along with them, since no format has
+            wall velocities.
         overwrite: whether to replace an earlier export, or to write beside other files.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
@@ -119,444 +107,289 @@ def export(
             nowhere.
         WorkFailedError: the disk is full or not writable.
     """
-    file_format = parse_format(format)
-    _check_from_walls(file_format, from_walls=from_walls)
+    if format not in FORMATS:
+        raise UsageError(f"no format {format!r}; name one of {', '.join(FORMATS)}")
     tier, data_root, rooted_registry = locate(split, size, root=root, registry=registry)
     target = expand_path(output, "--output")
-    path_by_subset = {}
-    for subset in HASHED_SUBSETS:
-        path_by_subset[subset] = target / f"{subset}{ENDINGS[file_format]}"
-    paths = tuple(path_by_subset.values())
-    _check_target(target, paths, overwrite=overwrite)
-
-    frames_by_subset = _frames_by_subset(tier, data_root)
-    statistics, dataset_sha256 = _recorded_statistics(tier, data_root)
-    spacing, has_wall_velocity = _inspect_scenario(
-        next(iter(frames_by_subset["train"])), tier
-    )
-    if from_walls is None:
-        is_measured_from_walls = (
-            tier.is_full_box or has_wall_velocity or tier.box.is_periodic
+    if (target / FORCE).exists():
+        raise UsageError(
+            f"{target / FORCE} is a program that readers of this format run; name "
+            "another folder: --output"
         )
-    else:
-        is_measured_from_walls = from_walls
+    if target.is_dir() and any(target.iterdir()) and not overwrite:
+        raise UsageError(
+            f"{target} holds files; name another folder: --output, or write beside and "
+            "over them: --overwrite"
+        )
+
+    paths_of: dict[str, list[Path]] = {subset: [] for subset in HASHED_SUBSETS}
+    frames_of: dict[str, list[int]] = {subset: [] for subset in HASHED_SUBSETS}
+    files_by_id = scenario_files(tier, data_root, HASHED_SUBSETS)
+    for scenario, path in sorted(files_by_id.items()):
+        subset = tier.subset_of(scenario)
+        paths_of[subset].append(path)
+        with read_scenario(path) as file:
+            frames_of[subset].append(file.header.frames)
+    with read_scenario(paths_of["train"][0]) as file:
+        volume = file.read_particle_mass() / float(tier.value("density"))
+        has_moving_walls = "wall_velocity" in file.variables
+    spacing = volume ** (1.0 / tier.dimension)
     walls = None
     if wall_particles:
-        has_unit_box = from_walls is False and file_format is Format.LAGRANGEBENCH_H5
-        _check_walls(
-            tier, has_wall_velocity=has_wall_velocity, has_unit_box=has_unit_box
-        )
-        walls = WallParticles(tier.bounds, spacing)
-    wall_thickness = None
-    if walls is not None:
-        wall_thickness = walls.thickness
-    origin = (0.0,) * tier.dimension
-    if file_format is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or walls):
-        origin = _lower_corner(tier, wall_thickness or 0.0)
+        if not has_moving_walls or tier.box.is_periodic or tier.dimension != 2:
+            raise UsageError(
+                f"--wall-particles needs a box of two dimensions with four walls, and "
+                f"{tier.split} has none; leave the option out"
+            )
+        walls = _WallParticles(tier.bounds, spacing)
+    if from_walls is None:
+        from_walls = tier.is_full_box or has_moving_walls or tier.box.is_periodic
 
-    with contextlib.suppress(OSError):  # written last, it says that an export is whole
-        (target / NAME).unlink()
     meter = Meter(progress)
-    scenario_count = sum(map(len, frames_by_subset.values()))
-    meter.begin("exporting", total=len(frames_by_subset), scenarios=scenario_count)
-    shapes: dict[str, list[tuple[int, int]]] = {}
-    for subset, frames in frames_by_subset.items():
-        path = path_by_subset[subset]
-        runs = _read_runs(frames, file_format, tier.frame_interval, walls)
-        if file_format is Format.GNS_NPZ:
-            shapes[subset] = gns_npz.write(path, runs)
-        else:
-            shortest = min(frames.values())
-            shapes[subset] = _write_h5(path, runs, length=shortest, origin=origin)
-        meter.count(1, scenarios=len(frames))
-
-    info = ExportInfo(
-        title=rooted_registry.split(tier.split).title,
-        dataset_sha256=dataset_sha256,
-        statistics=statistics,
-        spacing=spacing,
-        origin=origin,
-        from_walls=is_measured_from_walls,
-        is_free_slip=_is_free_slip(tier),
-        wall_thickness=wall_thickness,
-    )
-    metadata = describe_export(tier, file_format, shapes, info)
-    metadata_path = write_metadata(target, metadata)
-    written = (*paths, metadata_path)
-    return _summarise(
-        tier,
-        file_format,
-        target,
-        written,
-        frames_by_subset,
-        shapes,
-        loses_wall_motion=has_wall_velocity and not wall_particles,
-    )
-
-
-def _check_from_walls(file_format: Format, *, from_walls: bool | None) -> None:
-    """Refuse the option --from-walls for a format that has none."""
-    if from_walls and file_format is not Format.LAGRANGEBENCH_H5:
-        raise UsageError(
-            "this option is for lagrangebench-h5 only",
-            where="--from-walls",
-            expected="--format lagrangebench-h5",
-            got=file_format.value,
-            fix="leave --from-walls out",
+    scenario_count = sum(map(len, paths_of.values()))
+    meter.begin("exporting", total=scenario_count, scenarios=scenario_count)
+    count = partial(meter.count, 1, scenarios=1)
+    if format == "vtkhdf":
+        files = []
+        shapes = {}
+        for subset, paths in paths_of.items():
+            shapes[subset] = []
+            for path in paths:
+                copy = target / subset / f"{path.stem}.vtkhdf"
+                shapes[subset].append(vtkhdf.write(copy, path))
+                files.append(copy)
+                count()
+    else:
+        origin = np.zeros(tier.dimension)
+        if format == "lagrangebench-h5" and (from_walls or walls):
+            thickness = walls.thickness if walls else 0.0
+            lows = np.array(tier.bounds)[:, 0] - thickness
+            # taking it off a float32 above it and below 16 loses no bit
+            origin = np.floor(lows * 2**20) / 2**20
+        module: Any = gns_npz if format == "gns-npz" else lagrangebench_h5
+        shapes = {}
+        files = []
+        for subset, paths in paths_of.items():
+            files.append(target / f"{subset}{FORMATS[format]}")
+            runs = _read_runs(paths, module, tier.frame_interval, walls, count)
+            if format == "gns-npz":
+                shapes[subset] = gns_npz.write(files[-1], runs)
+            else:
+                shapes[subset] = lagrangebench_h5.write(
+                    files[-1], runs, length=min(frames_of[subset]), origin=origin
+                )
+        metadata = _describe(
+            tier,
+            module,
+            shapes,
+            spacing=spacing,
+            origin=origin,
+            from_walls=from_walls,
+            walls=walls,
+            title=rooted_registry.split(tier.split).title,
+            record=_recorded_statistics(tier, data_root),
         )
-
-
-def _summarise(
-    size: Size,
-    file_format: Format,
-    folder: Path,
-    files: tuple[Path, ...],
-    frames_of: Mapping[str, Mapping[Path, int]],
-    shapes: Mapping[str, Sequence[tuple[int, int]]],
-    *,
-    loses_wall_motion: bool,
-) -> ExportResult:
-    """Return what was written.
-
-    Args:
-        size: the data set.
-        file_format: format of the files.
-        folder: folder of the files.
-        files: the files, metadata.json too.
-        frames_of: frames of each scenario file by subset.
-        shapes: frames and particles of each trajectory that was written, by subset.
-        loses_wall_motion: whether walls may move and the files do not tell how.
-    """
-    trajectory_counts = {}
-    frame_counts = {}
-    left_out = 0
-    for subset, trajectories in shapes.items():
-        written_frames = sum(frames for frames, _ in trajectories)
-        present_frames = sum(frames_of[subset].values())
-        trajectory_counts[subset] = len(trajectories)
-        frame_counts[subset] = written_frames
-        left_out += present_frames - written_frames
+        files.append(target / "metadata.json")
+        text = json.dumps(metadata, indent=1) + "\n"
+        write_atomically(files[-1], text.encode(), option="--output")
+    frames = {subset: sum(n for n, _ in rows) for subset, rows in shapes.items()}
+    present = sum(map(sum, frames_of.values()))
     return ExportResult(
-        format=file_format.value,
-        split=size.split,
-        size=size.name,
-        folder=folder,
-        files=files,
-        trajectories=trajectory_counts,
-        frames=frame_counts,
-        left_out=left_out,
-        loses_wall_motion=loses_wall_motion,
+        format=format,
+        split=tier.split,
+        size=tier.name,
+        folder=target,
+        files=tuple(files),
+        trajectories={subset: len(rows) for subset, rows in shapes.items()},
+        frames=frames,
+        left_out=present - sum(frames.values()),
+        loses_wall_motion=has_moving_walls and walls is None,
         bytes=sum(path.stat().st_size for path in files),
     )
 
 
-def _lower_corner(size: Size, wall_thickness: float) -> tuple[float, ...]:
-    """Return what is taken off every position of lagrangebench-h5 [length].
-
-    No position is below 0 then, where the bounds start.
-    """
-    return tuple(round_down(low - wall_thickness) for low, _ in size.bounds)
-
-
-def _check_target(folder: Path, files: Sequence[Path], *, overwrite: bool) -> None:
-    """Refuse a folder that must not be written to."""
-    if (folder / FORCE).exists():
-        raise UsageError(
-            "the folder holds a program that readers of this format run",
-            where=str(folder / FORCE),
-            expected=f"a folder without {FORCE}",
-            got=FORCE,
-            fix="name another folder: --output",
-        )
-    existing = []
-    for path in (*files, folder / NAME):
-        if path.exists():
-            existing.append(path.name)
-    if existing and not overwrite:
-        raise UsageError(
-            "files of that name are there",
-            where=str(folder),
-            expected="a folder without files of these names",
-            got=", ".join(existing),
-            fix="replace them: --overwrite; or name another folder: --output",
-        )
-    if folder.is_dir() and not overwrite:
-        others = []
-        for path in sorted(folder.iterdir()):
-            if not path.name.startswith("."):  # hidden, as some file browsers leave
-                others.append(path.name)
-        if others:
-            raise UsageError(
-                "the folder holds other files",
-                where=str(folder),
-                expected="an empty folder, or a new one",
-                got=", ".join(others[:5]),
-                fix="name another folder: --output; or write beside these files: "
-                "--overwrite",
-            )
-
-
-def _check_walls(size: Size, *, has_wall_velocity: bool, has_unit_box: bool) -> None:
-    """Refuse wall particles where no wall can move, or where they have no room."""
-    if not has_wall_velocity or size.box.is_periodic or size.dimension != 2:
-        raise UsageError(
-            "wall particles need a box of two dimensions with four walls",
-            where="--wall-particles",
-            expected="a split such as cavity",
-            got=size.split,
-            fix="leave --wall-particles out",
-        )
-    if has_unit_box:
-        raise UsageError(
-            "wall particles lie outside the unit box's bounds",
-            where="--wall-particles and --unit-box",
-            expected="one of the two",
-            got="both",
-            fix="leave out --unit-box",
-        )
-
-
-def _inspect_scenario(path: Path, size: Size) -> tuple[float, bool]:
-    """Return the spacing of particles [length], and whether walls may move."""
-    with read_scenario(path) as file:
-        mass = file.read_particle_mass()
-        has_wall_velocity = "wall_velocity" in file.variables
-    volume = mass / float(size.value("density"))
-    if size.dimension == 2:
-        return math.sqrt(volume), has_wall_velocity
-    return math.cbrt(volume), has_wall_velocity
-
-
-def _is_free_slip(size: Size) -> bool:
-    """Return whether liquid slides along the walls, as with unknown solvers."""
-    if not size.simulated:
-        return True
-    return not getattr(solver_constants(size), "no_slip", False)
-
-
-class WallParticles:
+class _WallParticles:
     """Layers of particles beside each wall of a box.
 
     They go along with the wall, and what leaves at one end comes in at the other.
     """
 
-    def __init__(self, bounds: Bounds, spacing: float) -> None:
+    def __init__(self, bounds: Sequence[Sequence[float]], spacing: float) -> None:
         self.thickness = WALL_LAYERS * spacing
-        self._bounds = np.array(bounds)
-        low, high = self._bounds.T
-        # wall, place along it [length], place across it [length]
-        rows: list[tuple[int, float, float]] = []
+        low, high = np.array(bounds).T
         depths = spacing * (np.arange(WALL_LAYERS) + 0.5)
+        walls = []
+        places = []
         for wall, axis in enumerate(WALL_AXES):
-            other_axis = 1 - axis
-            length = high[axis] - low[axis]
-            count = max(1, round(length / spacing))
-            pitch = length / count
-            for depth in depths:
-                if wall in LOW_WALLS:
-                    across = low[other_axis] - depth
-                else:
-                    across = high[other_axis] + depth
-                for number in range(count):
-                    along = low[axis] + pitch * (number + 0.5)
-                    rows.append((wall, along, across))
-        walls, along, across = np.array(rows).T
-        self.wall = walls.astype(int)  # which each particle lies beside
-        self._along = along
-        self._across = across
+            count = max(1, round((high[axis] - low[axis]) / spacing))
+            pitch = (high[axis] - low[axis]) / count
+            along = low[axis] + pitch * (np.arange(count) + 0.5)
+            other = 1 - axis
+            is_low = wall in (0, 2)
+            across = low[other] - depths if is_low else high[other] + depths
+            place = np.empty((WALL_LAYERS, count, 2))
+            place[..., axis] = along
+            place[..., other] = across[:, None]
+            places.append(place.reshape(-1, 2))
+            walls.append(np.full(WALL_LAYERS * count, wall))
+        self.wall = np.concatenate(walls)  # which each particle lies beside
+        self._start = np.concatenate(places)
+        self._low = low
+        self._high = high
 
-    def read_with_walls(
-        self, file: ScenarioFile, travel: NDArray[np.float64], frame: int
+    def positions(
+        self, wall_velocity: NDArray[np.floating], interval: float
     ) -> NDArray[np.float32]:
-        """Return positions of a frame's particles and, behind them, of wall particles.
+        """Return positions [frame, particle, axis] of particles that go with the walls.
 
-        ``travel`` is how far walls have gone [length], shape [frame, wall].
+        ``wall_velocity`` is [frame, wall, axis]; entry f acts from frame f-1 to f.
         """
-        wall_axes = np.array(WALL_AXES)
-        axis = wall_axes[self.wall]
-        low, high = self._bounds[axis].T
-        start = self._along - low
-        moved = start + travel[frame, self.wall]
-        along = low + moved % (high - low)
-        is_along = axis[:, None] == [0, 1]  # [particle, space]
-        exact_places = np.where(is_along, along[:, None], self._across[:, None])
-        wall_position = exact_places.astype(np.float32)
-        position = file.read("position", frame)
-        return np.concatenate([position, wall_position])
+        along = wall_velocity[:, np.arange(len(WALL_AXES)), WALL_AXES]
+        steps = interval * along.astype(np.float64)
+        steps[0] = 0.0
+        travel = np.cumsum(steps, axis=0)[:, self.wall]
+        axes = WALL_AXES[self.wall]
+        rows = np.arange(len(axes))
+        position = np.repeat(self._start[None], len(travel), axis=0)
+        low = self._low[axes]
+        length = self._high[axes] - low
+        moved = position[:, rows, axes] - low + travel
+        position[:, rows, axes] = low + moved % length
+        return position.astype(np.float32)
 
 
 def _read_runs(
-    files: Iterable[Path],
-    file_format: Format,
+    paths: Sequence[Path],
+    module: Any,  # noqa: ANN401 (gns_npz or lagrangebench_h5)
     interval: float,
-    walls: WallParticles | None,
+    walls: _WallParticles | None,
+    count: Callable[[], None],
 ) -> Iterator[Run]:
-    """Yield the scenarios of a subset, each open until the next one is asked for."""
-    for path in files:
+    """Yield the trajectories of a subset."""
+    numbers = np.array([module.KINDS[name] for name in MATERIALS])
+    for path in paths:
         with read_scenario(path) as file:
-            kinds = material_numbers(file_format, file.read("material"))
-            if walls is None:
-                yield file.header.frames, partial(file.read, "position"), kinds
-                continue
-            wall_velocity = file.read("wall_velocity")
-            wall_kinds = _wall_kinds(file_format, wall_velocity, walls)
-            travel = _wall_travel(wall_velocity, interval)
-            read_position = partial(walls.read_with_walls, file, travel)
-            kinds = np.concatenate([kinds, wall_kinds])
-            yield file.header.frames, read_position, kinds
-
-
-def _wall_kinds(
-    file_format: Format, wall_velocity: NDArray[np.floating], walls: WallParticles
-) -> NDArray[np.int64]:
-    """Return the number of each wall particle: of a wall at rest, or one that moves."""
-    at_rest, moving = WALL_NUMBERS[file_format]
-    ever_moves = (wall_velocity != 0.0).any(axis=(0, 2))
-    return np.where(ever_moves[walls.wall], moving, at_rest)
-
-
-def _wall_travel(
-    wall_velocity: NDArray[np.floating], interval: float
-) -> NDArray[np.float64]:
-    """Return how far each wall has gone along itself [length], shape [frame, wall]."""
-    walls = range(len(WALL_AXES))
-    along = wall_velocity[:, walls, WALL_AXES].astype(np.float64)
-    steps = interval * along
-    steps[0] = 0.0  # velocity[f] acts from frame f-1 to f
-    return np.cumsum(steps, axis=0)
-
-
-def _write_h5(
-    path: Path, runs: Iterable[Run], *, length: int, origin: tuple[float, ...]
-) -> list[tuple[int, int]]:
-    """Write one subset for LagrangeBench, whole or not at all.
-
-    LagrangeBench takes the length of the first trajectory for all. So each run is cut
-    into trajectories of this length, and the frames left over are not written. Chunks
-    have one frame: LagrangeBench reads these 5 to 10 times faster than other chunks.
-
-    Args:
-        path: the file.
-        runs: scenarios, or their active frames.
-        length: frames of each trajectory.
-        origin: point from which positions are measured [length].
-
-    Returns:
-        Frames and particles of each trajectory.
-    """
-    shift = np.asarray(origin, np.float32)
-    shapes: list[tuple[int, int]] = []
-    with (
-        atomic_path(path, option="--output") as temporary,
-        h5py.File(temporary, "w", libver="earliest") as out,
-    ):
-        for frame_count, read_position, kinds in runs:
-            particle_count = len(kinds)
-            for start in range(0, frame_count - length + 1, length):
-                group = out.create_group(f"{len(shapes):05d}")
-                stored = group.create_dataset(
-                    "position",
-                    shape=(length, particle_count, len(shift)),
-                    dtype="<f4",
-                    chunks=(1, particle_count, len(shift)),
-                    compression="gzip",
-                    compression_opts=1,
-                    shuffle=True,
-                    track_times=False,
-                )
-                for row in range(length):
-                    stored[row] = read_position(start + row) - shift
-                group.create_dataset(
-                    "particle_type", data=kinds.astype("<i8"), track_times=False
-                )
-                shapes.append((length, particle_count))
-    return shapes
+            position = file.read("position")
+            kinds = numbers[file.read("material")]
+            if walls is not None:
+                wall_velocity = file.read("wall_velocity")
+                beside = walls.positions(wall_velocity, interval)
+                position = np.concatenate([position, beside], axis=1)
+                ever_moves = (wall_velocity != 0.0).any(axis=(0, 2))[walls.wall]
+                at_rest, moving = module.WALLS
+                wall_kinds = np.where(ever_moves, moving, at_rest)
+                kinds = np.concatenate([kinds, wall_kinds])
+        yield position, kinds
+        count()
 
 
 def _recorded_statistics(
     size: Size, root: Path
-) -> tuple[dict[str, tuple[float, ...]], str]:
+) -> tuple[Mapping[str, Sequence[float]], str]:
     """Return statistics over train and the data set hash.
 
     They are those of the registry, else of the manifest.
     """
+    statistics: Mapping[str, Sequence[float]] = {}
+    digest = None
     if size.measured:
-        statistics = dict(size.measured.statistics)
-        _check_names_of_statistics(size, statistics)
-        return statistics, size.measured.dataset_sha256
-    manifest = read_manifest(root, size.split, size.name, size.major)
-    if manifest is None or manifest.dataset_sha256 is None or not manifest.statistics:
+        statistics = size.measured.statistics
+        digest = size.measured.dataset_sha256
+    else:
+        manifest = read_manifest(root, size.split, size.name, size.major)
+        if manifest is not None:
+            statistics = manifest.statistics
+            digest = manifest.dataset_sha256
+    needed = {"velocity_mean", "velocity_std", "acceleration_mean", "acceleration_std"}
+    if digest is None or not needed <= set(statistics):
         raise DataError(
-            "the data set is not complete: the statistics of train are "
-            "recorded nowhere",
-            where=f"{size.split} {size.name} in {root}",
-            expected="all scenarios of train",
-            got="some, and no recorded statistics",
-            fix=suggest_repair(size, root=root),
+            f"{size.split} {size.name}: statistics of train are recorded nowhere, or "
+            f"without an acceleration; {suggest_repair(size, root=root)}"
         )
-    if not has_all_statistics(manifest, size):
-        raise DataError(
-            "the manifest has no whole statistics of train",
-            where=f"{size.split} {size.name} in {root}, key statistics",
-            expected="mean and standard deviation of position, velocity and "
-            f"acceleration, each of {size.dimension} numbers",
-            got=_count_numbers(manifest.statistics),
-            fix=suggest_repair(size, root=root),
-        )
-    return dict(manifest.statistics), manifest.dataset_sha256
+    return statistics, digest
 
 
-def _check_names_of_statistics(
-    size: Size, statistics: Mapping[str, Sequence[float]]
-) -> None:
-    """Refuse recorded statistics that lack a quantity which the metadata state.
-
-    Train with two frames for each scenario has velocities, but no acceleration.
-    """
-    missing_names = []
-    for quantity in SHORT_NAMES.values():
-        for name in (f"{quantity}_mean", f"{quantity}_std"):
-            if name not in statistics:
-                missing_names.append(name)
-    if not missing_names:
-        return
-    raise DataError(
-        "the recorded statistics of train lack a quantity",
-        where=f"{size.split} {size.name} in {size.file}, key statistics",
-        expected="mean and standard deviation of velocity and acceleration",
-        got=f"no {', no '.join(missing_names)}",
-        fix="make the split again with three frames or more in a scenario of train: "
-        "an acceleration needs three",
-    )
-
-
-def _count_numbers(statistics: Mapping[str, Sequence[float]]) -> str:
-    """Return the names of statistics, and how many numbers each has, for a message."""
-    counts = [f"{name}: {len(row)}" for name, row in statistics.items()]
-    return ", ".join(counts)
-
-
-def _frames_by_subset(size: Size, root: Path) -> dict[str, dict[Path, int]]:
-    """Return files and their frames by subset, in order of their ids.
-
-    The header of each file is compared with the registry.
-    """
-    frames_of: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
-    for scenario, path in sorted(scenario_files(size, root, HASHED_SUBSETS).items()):
-        with read_scenario(path) as file:
-            header = file.header
-        expected_hash = size.registered_hash(scenario)
-        is_right_scenario = (
-            header.key.major == size.major and header.key.scenario == scenario
-        )
-        if not is_right_scenario or not header.content_sha256.startswith(expected_hash):
-            raise DataError(
-                "a scenario is not that of the registry",
-                where=str(path),
-                expected=f"scenario {scenario}, content hash {expected_hash or 'any'}",
-                got=f"scenario {header.key.scenario}, content hash "
-                f"{header.content_sha256[:16]}",
-                fix=f"lagbench verify --split {size.split} --size {size.name}",
-            )
-        frames_of[size.subset_of(scenario)][path] = header.frames
-    return frames_of
+def _describe(
+    size: Size,
+    module: Any,  # noqa: ANN401 (gns_npz or lagrangebench_h5)
+    shapes: Mapping[str, Sequence[tuple[int, int]]],
+    *,
+    spacing: float,
+    origin: NDArray[np.float64],
+    from_walls: bool,
+    walls: _WallParticles | None,
+    title: str,
+    record: tuple[Mapping[str, Sequence[float]], str],
+) -> dict[str, Any]:
+    """Return the metadata of an export, with the keys of its format and our own."""
+    statistics, digest = record
+    bounds = (np.array(size.bounds) - origin[:, None]).tolist()
+    metadata: dict[str, Any] = {
+        "bounds": bounds,
+        "default_connectivity_radius": size.task.radius,
+        "dim": size.dimension,
+        "periodic_boundary_conditions": list(size.box.periodic),
+    }
+    for prefix, name in (("vel", "velocity"), ("acc", "acceleration")):
+        metadata[f"{prefix}_mean"] = list(statistics[f"{name}_mean"])
+        # models divide by a deviation: 0 becomes 1
+        deviations = statistics[f"{name}_std"]
+        metadata[f"{prefix}_std"] = [deviation or 1.0 for deviation in deviations]
+    frame_counts = {subset: rows[0][0] for subset, rows in shapes.items()}
+    if module is gns_npz:
+        every = [frames for rows in shapes.values() for frames, _ in rows]
+        metadata |= {"sequence_length": min(every), "dt": size.frame_interval}
+    else:
+        viscosity = size.parameters.get("liquid_viscosity")
+        gravity = size.parameters.get("gravity")
+        no_slip = size.simulated and getattr(solver_constants(size), "no_slip", False)
+        every = [particles for rows in shapes.values() for _, particles in rows]
+        metadata |= {
+            "case": size.split.upper(),
+            "solver": "MPM" if size.simulated else "unknown",
+            "density_evolution": False,
+            "dx": spacing,
+            "dt": size.dt,  # of the solver
+            "write_every": size.substeps_per_frame,
+            "t_end": (max(frame_counts.values()) - 1) * size.frame_interval,
+            "viscosity": None if viscosity is None else viscosity.value,
+            "p_bg_factor": 0.0,
+            "g_ext_magnitude": 0.0 if gravity is None else gravity.value,
+            "artificial_alpha": 0.0,
+            "free_slip": not no_slip,
+            "is_bc_trick": False,
+            # one less than frames: the last one is a target only
+            "sequence_length_train": frame_counts["train"] - 1,
+            "sequence_length_test": frame_counts["test"] - 1,
+            "num_trajs_train": len(shapes["train"]),
+            "num_trajs_test": len(shapes["test"]),
+            "num_particles_max": max(every),
+        }
+        # Its cell lists start at 0 and are as long as the bounds are apart: particles
+        # beyond the difference would lose their neighbours.
+        for axis, (low, high) in enumerate(size.bounds):
+            if walls is not None:
+                bounds[axis] = [0.0, high + walls.thickness - float(origin[axis])]
+            elif not from_walls:
+                is_periodic = size.box.periodic[axis]
+                bounds[axis] = [low, high] if is_periodic else [0.0, 1.0]
+    task = size.task
+    metadata["lagbench"] = {
+        "split": size.split,
+        "size": size.name,
+        "version": size.version,
+        "title": title,
+        "dataset_sha256": digest,
+        "particle_type": module.KINDS,
+        "origin": origin.tolist(),
+        "bounds": [list(side) for side in size.bounds],
+        "spacing": spacing,
+        "density": size.value("density"),
+        "input_frames": task.input_frames,
+        "horizon": task.horizon,
+        "frames_of_interest": list(task.frames_of_interest),
+        "cells": task.score_grid.cells,
+        "placement": task.score_grid.placement,
+        "wall_particle_type": sorted(set(module.WALLS)) if walls else [],
+    }
+    return metadata

@@ -1,0 +1,559 @@
+"""Judge positions as trajectories, whatever file or program they come from.
+
+A reader can hand over positions in which rows change their order, frames are missing or
+particles are padding, and no program complains: training and scores are just wrong. So
+the motion itself is looked at.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import DataError
+
+from .box import AXES, Box, unit_box
+
+Floats = NDArray[np.float64]
+
+MOST_SAMPLES = 500
+"""Particles whose motion is looked at."""
+
+NEIGHBOURS = 9
+"""Nearest particles, itself included, whose median motion is the surroundings'."""
+
+MOST_STRANGE = 0.2
+"""Share of particles that may look like another one in the next frame.
+
+Splashes of which every eighth frame is given reach 0.13, rows in another order 0.28 to
+1.
+"""
+
+NEARER = 0.2
+"""Distance to the old place of another particle over the own step, at most, where a row
+is another particle.
+"""
+
+SPIKE = 3.0
+"""Motion into one frame over that before and after it which no flow has."""
+
+GAP = 1.6
+"""The same for motion in one direction: it doubles where a frame is missing."""
+
+FAR = 20.0
+"""Extent of a frame, or distance of a particle from the middle, over the usual one."""
+
+FEWEST_TOGETHER = 3
+"""Particles at exactly one place that are padding, or parked."""
+
+COARSE = 20.0
+USELESS = 2.0
+"""Motion in a frame over the resolution of the numbers, at least: else a note, or none
+is accepted.
+"""
+
+SAME = 1e-5
+"""Difference of the moments of two frames that hold the same particles [extent]."""
+
+MOST_COPIES = 8
+"""Frames of other trajectories that are compared with one."""
+
+LATE = 0.4
+"""Error of a prediction against the frame before over that against its own frame."""
+
+FILL = 1e30
+"""Larger numbers stand for missing ones, as netCDF's 9.97e36."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """What the positions of one trajectory say."""
+
+    name: str  # file and number of the trajectory, for messages
+    low: Floats  # lowest position [length], [axis]
+    high: Floats  # highest position [length], [axis]
+    moments: Floats  # mean, covariance and skewness of the positions, [frame, moment]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def extent(self) -> float:
+        """Longest side of the box that all positions fill [length]."""
+        return float((self.high - self.low).max())
+
+
+def judge_trajectory(
+    name: str,
+    frames: Iterable[tuple[NDArray[np.floating], NDArray[np.floating] | None]],
+    *,
+    box: Box | None = None,
+    frame_interval: float = 1.0,
+) -> Judgement:
+    """Refuse frames that are no trajectory of the same particles.
+
+    Args:
+        name: file and number of the trajectory.
+        frames: positions [length] and velocities [length/s] or None, [particle, axis].
+        box: where it repeats itself; walls all around when None.
+        frame_interval: time between two frames [s].
+
+    Raises:
+        DataError: a position is missing, particles are padding or blown up, rows change
+            their order, frames are missing or there twice, periods are not those of
+            the jumps, or velocities contradict the motion.
+    """
+    motion = _Motion(name)
+    moments = []
+    sides = []
+    for number, (raw_position, velocity) in enumerate(frames):
+        position = raw_position.astype(np.float64)
+        where = f"{name}, frame {number}"
+        _refuse_missing(position, where)
+        _refuse_together(raw_position, where)
+        if number == 0:
+            box = box or unit_box(position.shape[1])
+            _refuse_lone_particle(position, where)
+        sides.append((position.min(axis=0), position.max(axis=0)))
+        moments.append(_moments(position))
+        motion.add(position, velocity, box)
+    low, high = np.array(sides).transpose(1, 0, 2)
+    _refuse_blow_up(name, (high - low).max(axis=1))
+    motion.refuse_reordered_rows()
+    motion.refuse_uneven_frames()
+    motion.refuse_jumps(box or unit_box(2))
+    motion.refuse_velocities(frame_interval)
+    notes = [*motion.describe_resolution(raw_position), *motion.describe_rest()]
+    return Judgement(
+        name=name,
+        low=low.min(axis=0),
+        high=high.max(axis=0),
+        moments=np.array(moments),
+        notes=notes,
+    )
+
+
+def _refuse_missing(position: Floats, where: str) -> None:
+    is_missing = ~(np.abs(position) < FILL).all(axis=1)
+    if not is_missing.any():
+        return
+    first = int(np.argmax(is_missing))
+    raise DataError(
+        f"{where}: particle {first} has no position ({position[first].tolist()}), as "
+        f"{np.count_nonzero(is_missing)} of {len(position)}; leave out particles that "
+        "are not there in all frames, or end the trajectory before this frame"
+    )
+
+
+def _refuse_together(position: NDArray[np.floating], where: str) -> None:
+    """Refuse three or more particles at one place."""
+    order = np.argsort(position[:, 0], kind="stable")
+    column = position[order, 0]
+    is_equal = column[1:] == column[:-1]
+    candidates = np.zeros(len(position), bool)
+    candidates[order[1:][is_equal]] = True
+    candidates[order[:-1][is_equal]] = True
+    if np.count_nonzero(candidates) < FEWEST_TOGETHER:
+        return
+    places, counts = np.unique(position[candidates], axis=0, return_counts=True)
+    most = int(np.argmax(counts))
+    if counts[most] < FEWEST_TOGETHER:
+        return
+    first = int(np.argmax((position == places[most]).all(axis=1)))
+    raise DataError(
+        f"{where}: {counts[most]} of {len(position)} particles lie at one place, "
+        f"{places[most].tolist()}, as particle {first}: padding, or particles that "
+        "have left; leave these particles out, or end the trajectory before this frame"
+    )
+
+
+def _refuse_lone_particle(position: Floats, where: str) -> None:
+    """Refuse a particle far away from all others, as a fill value puts it."""
+    middle = np.median(position, axis=0)
+    distance = np.linalg.norm(position - middle, axis=1)
+    usual = float(np.quantile(distance, 0.95))
+    farthest = int(np.argmax(distance))
+    if len(position) < 20 or distance[farthest] <= FAR * usual or usual == 0.0:
+        return
+    raise DataError(
+        f"{where}: particle {farthest} lies at {position[farthest].tolist()}, "
+        f"{distance[farthest] / usual:.3g} times as far out as 95 % of the particles; "
+        "leave it out: it is a fill value, or was parked there"
+    )
+
+
+def _refuse_blow_up(name: str, extents: Floats) -> None:
+    usual = float(np.quantile(extents, 0.25))
+    is_far = extents > FAR * usual
+    if usual == 0.0 or not is_far.any():
+        return
+    numbers = np.flatnonzero(is_far)
+    first = int(numbers[0])
+    raise DataError(
+        f"{name}, frames {first} to {numbers[-1]}: particles spread over "
+        f"{extents.max():.3g}, in other frames over {usual:.3g}: the simulation blew "
+        f"up; end the trajectory before frame {first}"
+    )
+
+
+def _moments(position: Floats) -> Floats:
+    """Return mean, covariance and skewness of positions, whatever their order."""
+    mean = position.mean(axis=0)
+    offset = position - mean
+    covariance = offset.T @ offset / len(offset)
+    upper = np.triu_indices(len(mean))
+    return np.concatenate([mean, covariance[upper], (offset**3).mean(axis=0)])
+
+
+class _Motion:
+    """The steps of some particles of a trajectory, and the jumps of all."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.samples = np.zeros(0, int)  # numbers of the particles
+        self.before: Floats = np.zeros(0)  # positions in the frame before
+        self.step_before: Floats | None = None
+        self.steps: list[Floats] = []  # [frame] of [sample, axis]
+        self.gaps: list[Floats] = []  # ways to the nearest neighbour, of [sample]
+        self.others: list[Floats] = []  # ways to the nearest old place, of [sample]
+        self.strayed: list[Floats] = []  # steps beside those of neighbours, of [sample]
+        self.adjacent: list[float] = []  # share whose nearest neighbour is the next row
+        self.velocities: list[Floats] = []
+        # by axis: frame and signed step of particles that cross half the extent
+        self.jumps: dict[int, list[tuple[int, Floats]]] = {}
+        # by axis: true period less the stated one, by each crossing [length]
+        self.period_errors: dict[int, list[float]] = {}
+        self.low: Floats = np.zeros(0)
+        self.high: Floats = np.zeros(0)
+
+    def add(
+        self,
+        position: Floats,
+        velocity: NDArray[np.floating] | None,
+        box: Box,
+    ) -> None:
+        """Look at the next frame."""
+        count = len(position)
+        if not len(self.samples):
+            chosen = np.linspace(0, count - 1, min(count, MOST_SAMPLES))
+            self.samples = np.unique(chosen.astype(int))
+            self.low = position.min(axis=0)
+            self.high = position.max(axis=0)
+            self.before = position
+            return
+        step = box.displacement(self.before, position)
+        if count > 1:
+            self._compare_with_neighbours(position, step, box)
+        self.steps.append(step[self.samples])
+        if velocity is not None:
+            self.velocities.append(velocity[self.samples].astype(np.float64))
+        self.low = np.minimum(self.low, position.min(axis=0))
+        self.high = np.maximum(self.high, position.max(axis=0))
+        self._find_jumps(step, position - self.before, box)
+        self.before = position
+        self.step_before = step
+
+    def _compare_with_neighbours(
+        self, position: Floats, step: Floats, box: Box
+    ) -> None:
+        points = box.tree_points(self.before)
+        count = min(NEIGHBOURS, len(points))
+        tree = box.tree(self.before)
+        distances, rows = tree.query(points[self.samples], k=count)
+        self.others.append(tree.query(box.tree_points(position[self.samples]))[0])
+        own_step = step[self.samples]
+        surroundings = np.median(step[rows[:, 1:]], axis=1)
+        self.gaps.append(distances[:, 1])
+        self.strayed.append(np.linalg.norm(own_step - surroundings, axis=1))
+        is_next = (np.abs(rows - self.samples[:, None]) == 1)[:, 1:3].any(axis=1)
+        self.adjacent.append(float(is_next.mean()))
+
+    def _find_jumps(self, step: Floats, raw_step: Floats, box: Box) -> None:
+        """Note the steps that a boundary may explain."""
+        frame = len(self.steps)
+        extent = self.high - self.low
+        for axis in range(step.shape[1]):
+            column = step[:, axis]
+            is_jump = np.abs(column) > 0.5 * extent[axis]
+            is_calm = np.median(np.abs(column)) < 0.1 * extent[axis]
+            if is_calm and np.count_nonzero(is_jump) >= FEWEST_TOGETHER:
+                self.jumps.setdefault(axis, []).append((frame, column[is_jump]))
+            if not box.periodic[axis] or self.step_before is None:
+                continue
+            raw = raw_step[:, axis]
+            has_crossed = np.abs(raw) > 0.5 * box.lengths[axis]
+            change = (column - self.step_before[:, axis])[has_crossed]
+            errors = (np.sign(raw[has_crossed]) * change).tolist()
+            self.period_errors.setdefault(axis, []).extend(errors)
+
+    def refuse_reordered_rows(self) -> None:
+        """Refuse particles that are another one in the next frame.
+
+        A row is another particle where its step is longer than the way to its nearest
+        neighbour was, neither the steps before and after nor those of its neighbours
+        are like it, and the place of another particle in the frame before is far
+        nearer.
+        """
+        if not self.gaps:
+            return
+        steps = np.array(self.steps)
+        gaps = np.array(self.gaps)
+        lengths = np.linalg.norm(steps, axis=2)
+        change = np.linalg.norm(np.diff(steps, axis=0), axis=2)
+        least_change = np.full(lengths.shape, np.inf)
+        least_change[1:] = change
+        least_change[:-1] = np.minimum(least_change[:-1], change)
+        deviation = np.minimum(least_change, np.array(self.strayed))
+        own_way = np.minimum(lengths, deviation)
+        is_strange = (own_way > gaps) & (np.array(self.others) < NEARER * own_way)
+        share = is_strange.mean(axis=1)
+        frame = int(np.argmax(share > MOST_STRANGE))
+        if share[frame] > MOST_STRANGE:
+            sample = int(np.argmax(is_strange[frame]))
+            raise DataError(
+                f"{self.name}, frame {frame + 1}: {share[frame]:.0%} of the particles "
+                "move farther than the way to their nearest neighbour, as particle "
+                f"{self.samples[sample]} ({lengths[frame, sample]:.3g}, neighbour at "
+                f"{gaps[frame, sample]:.3g}): rows change their order from frame to "
+                "frame, or the axes have another order; order rows by particle "
+                "(an array id does it), or state --axes"
+            )
+        ratio = np.median(lengths / np.maximum(gaps, 1e-300), axis=1)
+        if np.median(ratio) > 2.0 and np.median(self.adjacent) > 0.8:
+            raise DataError(
+                f"{self.name}: particles move {np.median(ratio):.3g} times as far in a "
+                "frame as to their nearest neighbour, which is the next row: frames "
+                "and particles are exchanged; state the order of the axes, as in "
+                "--axes particle,frame,space, or mend the file"
+            )
+
+    def refuse_uneven_frames(self) -> None:
+        """Refuse frames that are missing, there twice, or out of order."""
+        for number in range(1, len(self.steps) - 1):
+            before, step, after = self.steps[number - 1 : number + 2]
+            mean = 0.5 * (before + after)
+            size = _rms(step)
+            usual = max(_rms(before), _rms(after))
+            is_steady = _rms(after - before) < 0.5 * _rms(mean)
+            fault = None
+            if size > SPIKE * usual > 0.0:
+                fault = "frames are missing or out of order, or rows change their order"
+            elif usual > 0.0 and is_steady:
+                ratio = float(np.sum(step * mean) / np.sum(mean * mean))
+                if ratio > GAP:
+                    fault = "frames are missing before it"
+                elif size == 0.0:
+                    fault = "the frame is there twice"
+                elif ratio < 0.0:
+                    fault = "frames are out of order"
+            if fault is not None:
+                raise DataError(
+                    f"{self.name}, frame {number + 1}: particles move {size:.3g}, and "
+                    f"{_rms(before):.3g} and {_rms(after):.3g} in the frames before "
+                    f"and after: {fault}; give all frames once, at even times, or end "
+                    "the trajectory before this frame"
+                )
+
+    def refuse_jumps(self, box: Box) -> None:
+        """Refuse jumps across the box that no stated period explains."""
+        for axis, jumps in self.jumps.items():
+            lengths = np.abs(np.concatenate([steps for _, steps in jumps]))
+            frame, first = jumps[0]
+            mean = float(lengths.mean())
+            where = f"{self.name}, frame {frame}: {len(first)} particles jump along "
+            where += f"{AXES[axis]} by {np.abs(first).max():.3g} and the others hardly "
+            where += "move"
+            if lengths.std() < 0.1 * mean:
+                raise DataError(
+                    f"{where}: if the box repeats itself there, state --periodic "
+                    f"{AXES[axis]} and --bounds whose ends are the period apart, about "
+                    f"{mean:.3g}"
+                )
+            raise DataError(
+                f"{where}, each by another length: rows change their order, or "
+                "particles leave and enter elsewhere (inflow and outflow); order rows "
+                "by particle, or end the trajectory where particles leave"
+            )
+        spacing = float(np.median(self.gaps)) if self.gaps else 0.0
+        for axis, errors in self.period_errors.items():
+            if len(errors) < 5:
+                continue
+            error = float(np.median(errors))
+            spread = float(np.median(np.abs(np.array(errors) - error)))
+            if abs(error) > max(0.25 * spacing, 3.0 * spread):
+                period = box.lengths[axis]
+                raise DataError(
+                    f"{self.name}: particles jump by about {period + error:.5g} along "
+                    f"{AXES[axis]}, and the stated period is {period:.5g}; state "
+                    "--bounds whose ends are the true period apart"
+                )
+
+    def refuse_velocities(self, frame_interval: float) -> None:
+        """Refuse velocities of another size or direction than the motion.
+
+        A particle turns between two frames, so the limits are wide.
+        """
+        if not self.velocities:
+            return
+        velocity = np.array(self.velocities)
+        motion = np.array(self.steps) / frame_interval
+        speed = _rms(velocity)
+        size = _rms(motion)
+        if size == 0.0 and speed == 0.0:
+            return
+        ratio = speed / size if size else math.inf
+        cosine = 0.0
+        if speed * size > 0.0:
+            products = np.sum(velocity * motion, axis=2)
+            cosine = float(products.mean()) / (speed * size)
+        if 0.25 <= ratio <= 4.0 and cosine >= 0.25:
+            return
+        raise DataError(
+            f"{self.name}: velocities are {ratio:.3g} times as large as the motion of "
+            f"the particles, with a cosine of {cosine:.2g}; mend their unit or the "
+            "frame interval, or leave velocities out: they are then differences of "
+            "positions"
+        )
+
+    def describe_resolution(self, position: NDArray[np.floating]) -> list[str]:
+        """Return a note on numbers too coarse for the motion; refuse useless ones."""
+        largest = max(map(_rms, self.steps), default=0.0)
+        quantum = _resolution(position[self.samples])
+        if largest == 0.0 or largest >= COARSE * quantum:
+            return []
+        text = (
+            f"{self.name}: positions are multiples of {quantum:.2g}, and particles "
+            f"move {largest:.2g} in a frame at most"
+        )
+        if largest < USELESS * quantum:
+            raise DataError(
+                f"{text}: their motion is noise; write more digits, or fewer frames"
+            )
+        error = 0.41 * quantum / largest  # of a difference of two rounded numbers
+        return [f"{text}: velocities are wrong by {error:.0%}; write more digits"]
+
+    def describe_rest(self) -> list[str]:
+        """Return a note on frames at the end in which nothing moves."""
+        resting_count = 0
+        for step in reversed(self.steps):
+            if step.any():
+                break
+            resting_count += 1
+        if resting_count == len(self.steps):
+            return [f"{self.name}: no particle moves from one frame to the next"]
+        if resting_count < 2:
+            return []
+        return [f"{self.name}: the last {resting_count} frames equal the one before"]
+
+
+def _rms(vectors: Floats) -> float:
+    """Return the root mean square length of vectors, [..., axis]."""
+    return math.sqrt(float(np.mean(np.sum(vectors**2, axis=-1))))
+
+
+def _resolution(values: NDArray[np.floating]) -> float:
+    """Return the least difference that numbers of this type and rounding can have."""
+    largest = np.abs(values).max()
+    quantum = float(np.spacing(largest))
+    for kind in (np.float32, np.float16):
+        with np.errstate(over="ignore"):
+            narrow = values.astype(kind)
+        if (narrow == values).all():
+            quantum = max(quantum, float(np.spacing(np.abs(narrow).max())))
+    for digits in range(1, 8):
+        error = np.abs(np.round(values.astype(np.float64), digits) - values)
+        if (error <= max(quantum, 1e-3 * 10.0**-digits)).all():
+            return max(quantum, 10.0**-digits)
+    return quantum
+
+
+def find_shared_frames(
+    judgements_of: Mapping[str, Sequence[Judgement]],
+) -> list[str]:
+    """Refuse a trajectory, or half of one, that two subsets share; note a few frames.
+
+    Two frames are the same if the moments of their positions are, in whatever order
+    their particles stand. Frames in which nothing moved since the one before do not
+    count.
+
+    Args:
+        judgements_of: the trajectories of each subset.
+
+    Raises:
+        DataError: a model would be tested on what it was trained on.
+    """
+    from scipy.spatial import cKDTree
+
+    judgements: list[Judgement] = []
+    subsets: list[str] = []
+    for subset, members in judgements_of.items():
+        judgements += members
+        subsets += [subset] * len(members)
+    extent = max(judgement.extent for judgement in judgements) or 1.0
+    frames_of = [_moving_frames(judgement, extent) for judgement in judgements]
+    shared: dict[tuple[int, int], int] = {}  # frames by trajectory and earlier one
+    for subset in list(judgements_of)[1:]:
+        start = subsets.index(subset) if subset in subsets else 0
+        if start == 0:
+            continue
+        earlier = np.concatenate(frames_of[:start])
+        owners = np.repeat(np.arange(start), list(map(len, frames_of[:start])))
+        tree = cKDTree(earlier)
+        nearest = np.arange(1, min(MOST_COPIES, len(earlier)) + 1)
+        for number in range(start, start + len(judgements_of[subset])):
+            distances, rows = tree.query(frames_of[number], k=nearest, p=np.inf)
+            for near, row in zip(distances, rows, strict=True):
+                for owner in set(owners[row[near < SAME]].tolist()):
+                    shared[owner, number] = shared.get((owner, number), 0) + 1
+    notes = []
+    for (first, second), count in sorted(shared.items()):
+        one = judgements[first]
+        other = judgements[second]
+        text = (
+            f"{one.name} ({subsets[first]}) and {other.name} ({subsets[second]}) share "
+            f"{count} frames"
+        )
+        shortest = min(len(one.moments), len(other.moments))
+        if count >= 0.5 * shortest:
+            raise DataError(
+                f"{text} of {shortest}: a model would be tested on what it was trained "
+                "on; give each run, and all pieces of a run, to one subset"
+            )
+        if count > 1:
+            notes.append(f"{text}: are they one run?")
+    return notes
+
+
+def _moving_frames(judgement: Judgement, extent: float) -> Floats:
+    """Return the moments of frames that differ from the one before, over the extent."""
+    moments = judgement.moments
+    dimension = len(judgement.low)
+    powers = np.full(moments.shape[1], 2.0)
+    powers[:dimension] = 1.0
+    powers[-dimension:] = 3.0
+    has_moved = np.ones(len(moments), bool)
+    has_moved[1:] = (moments[1:] != moments[:-1]).any(axis=1)
+    return np.asarray(moments[has_moved] / extent**powers)
+
+
+def find_shift(predicted: Floats, truth: Floats) -> int:
+    """Return by how many frames a prediction is late (-1) or early (1), else 0.
+
+    It is shifted if it fits the true frames before, or after, far better than its own.
+
+    Args:
+        predicted: positions of the first predicted frames [length], [frame, particle,
+            axis].
+        truth: true positions of the same frames, of the one before and of the one
+            after them.
+    """
+    count = len(predicted)
+    errors = [_rms(predicted - truth[start : start + count]) for start in range(3)]
+    if errors[1] == 0.0:
+        return 0
+    best = int(np.argmin(errors))
+    if errors[best] < LATE * errors[1]:
+        return best - 1
+    return 0
