@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 from browser import Browser, browser
 from command_line import CliRunner, Result
-from exchange_readers import straight_runs
 from filelock import FileLock
 from hypothesis import settings
 from registry_text import described_splits
 from score_bench import ScoreBench, bench_of
+from trajectories import straight_runs
 from turns import leave_out_slow_tests
 
 from lagbench.cli.program import app
@@ -480,6 +480,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
         output=folder / "root" / "own",
         radius=0.1,
         frame_interval=0.1,
+        axes="trajectory,frame,particle,space",
     )
 
 

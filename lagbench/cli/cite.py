@@ -95,8 +95,8 @@ def cite_command(
         lines.append(f"After: {escape_line(entry.citation)}.")
     if is_foreign and len(lines) == 1:
         lines.append(
-            "Its description names no work to cite: see `citation` and `licence` in its "
-            "split.yaml."
+            "Its description names no work to cite: see `citation` and `licence` in "
+            "its split.yaml."
         )
     for size, sha256 in hashes.items():
         lines.append(f"Data set hash of size {size}: {sha256}")

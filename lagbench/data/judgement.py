@@ -358,7 +358,15 @@ class _Motion:
 
     def refuse_jumps(self, box: Box) -> None:
         """Refuse jumps across the box that no stated period explains."""
-        for axis, jumps in self.jumps.items():
+        for axis, candidates in self.jumps.items():
+            least = 0.5 * (self.high - self.low)[axis]
+            jumps = []
+            for frame, steps in candidates:
+                is_long = np.abs(steps) > least
+                if np.count_nonzero(is_long) >= FEWEST_TOGETHER:
+                    jumps.append((frame, steps[is_long]))
+            if not jumps:
+                continue
             lengths = np.abs(np.concatenate([steps for _, steps in jumps]))
             frame, first = jumps[0]
             mean = float(lengths.mean())

@@ -27,7 +27,14 @@ from .local_split import (
     write_local_split,
 )
 from .names import Trajectory, name_trajectory, parse_kinds
-from .readers import Listing, Options, Source, list_sources, read_metadata
+from .readers import (
+    Listing,
+    Reading,
+    Source,
+    list_sources,
+    read_metadata,
+    reading,
+)
 from .spacing import ball_volume, estimate_spacing
 
 RADIUS = 2.0
@@ -111,7 +118,7 @@ def adopt(
             f"--axes: {', '.join(axes)} are not all known; name trajectory, frame, "
             "particle and space in their order, as in frame,particle,space"
         )
-    reading = Options(axes=axes, positions=positions)
+    reading = Reading(axes=axes, positions=positions)
     if isinstance(sources, str | Path | xr.Dataset):
         sources = [sources]
     listings, stated, text = _list_subsets(sources, reading, valid=valid, test=test)
@@ -164,7 +171,7 @@ def adopt(
 
 def _list_subsets(
     sources: Sequence[Data],
-    reading: Options,
+    reading: Reading,
     *,
     valid: int | None,
     test: int | None,
@@ -265,7 +272,8 @@ def _judge(
     """Read a trajectory once; refuse what is none, and note what a user should know."""
 
     def open_trajectory() -> Trajectory:
-        dataset = source.open()
+        with reading(source.name):
+            dataset = source.open()
         return _drop_constant_axes(name_trajectory(dataset, source.name, kinds))
 
     trajectory = open_trajectory()

@@ -51,21 +51,11 @@ class _ArrayUnpickler(pickle.Unpickler):
 
 
 def is_pickled(path: Path) -> bool:
-    """Return whether the first array of an npz file holds objects.
-
-    Raises:
-        UnreadableFileError: it is no npz file.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for member in archive.namelist():
-                with archive.open(member) as stream:
-                    return bool(_read_header(stream).hasobject)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise UnreadableFileError(
-            f"{path} is no npz file that can be read ({error}); save it again with "
-            "numpy.savez"
-        ) from error
+    """Return whether the first array of an npz file holds objects."""
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.namelist():
+            with archive.open(member) as stream:
+                return bool(_read_header(stream).hasobject)
     return False
 
 
@@ -89,7 +79,8 @@ def read(path: Path, name: str) -> xr.Dataset:
     """Return a trajectory: positions, kinds and, where it has one, a property.
 
     Raises:
-        UnreadableFileError: the file is damaged, or holds more than arrays.
+        UnreadableFileError: it holds something else.
+        pickle.UnpicklingError: its pickle names more than arrays.
     """
     key, _, number = name.partition(" ")
     item = _load(path, key)
@@ -118,15 +109,9 @@ def read(path: Path, name: str) -> xr.Dataset:
 
 def _load(path: Path, key: str) -> Any:  # noqa: ANN401
     """Return the object array of a member, made of arrays and numbers only."""
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open(f"{key}.npy") as stream:
-            _read_header(stream)
-            return _ArrayUnpickler(stream, encoding="latin1").load()
-    except Exception as error:  # damaged pickles raise nearly any type
-        raise UnreadableFileError(
-            f"{path}, key {key} is damaged, or holds more than arrays ({error}); fetch "
-            "it again, or save it with numpy.savez"
-        ) from error
+    with zipfile.ZipFile(path) as archive, archive.open(f"{key}.npy") as stream:
+        _read_header(stream)
+        return _ArrayUnpickler(stream, encoding="latin1").load()
 
 
 def write(

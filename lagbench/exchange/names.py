@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from lagbench.data import MATERIALS
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
+from .readers import reading
+
 DIMENSIONS = {
     "time": ("time", "frame", "step", "t"),
     "particle": ("particle", "particles", "atom", "point", "id"),
@@ -81,7 +83,8 @@ class Trajectory:
         length = max(1, BLOCK // max(1, position.nbytes // self.frames))
         first_ids = None
         for start in range(0, self.frames, length):
-            block = self.dataset.isel(time=slice(start, start + length)).load()
+            with reading(self.name):
+                block = self.dataset.isel(time=slice(start, start + length)).load()
             for row in range(block.sizes["time"]):
                 order: Any = slice(None)
                 frame = block.isel(time=row)

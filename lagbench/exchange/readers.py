@@ -11,6 +11,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -23,7 +24,13 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from lagbench.errors import DataError, UnreadableFileError, UsageError, require
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    require,
+)
 
 from . import gns_npz, lagrangebench_h5, vtkhdf
 
@@ -49,7 +56,7 @@ class Source:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class Reading:
     """How arrays without names are read."""
 
     axes: Sequence[str] = ()  # order of the axes; AXES where none are stated
@@ -64,7 +71,7 @@ class Listing:
     skipped: list[str] = field(default_factory=list)  # files that are not read
 
 
-def list_sources(path: Path, options: Options) -> Listing:
+def list_sources(path: Path, options: Reading) -> Listing:
     """Return the trajectories of a file, or of the files of a folder.
 
     A folder of files of one frame each (VTK, PLY, and tables or dumps that hold one
@@ -81,7 +88,8 @@ def list_sources(path: Path, options: Options) -> Listing:
             raise UnreadableFileError(
                 f"{path}: no format that is read; known are {', '.join(READERS)}"
             )
-        return Listing(sources=reader(path, options))
+        with reading(str(path)):
+            return Listing(sources=reader(path, options))
 
     files = []
     folders = []
@@ -121,6 +129,19 @@ def list_sources(path: Path, options: Options) -> Listing:
     return Listing(sources=sources, skipped=skipped)
 
 
+@contextmanager
+def reading(name: str) -> Iterator[None]:
+    """Turn what damaged bytes raise, nearly any type, into an UnreadableFileError."""
+    try:
+        yield
+    except LagbenchError:
+        raise
+    except Exception as error:
+        raise UnreadableFileError(
+            f"{name} cannot be read ({error}); write it again, or leave it out"
+        ) from error
+
+
 def natural_key(path: Path | str) -> list[tuple[int, str]]:
     """Return a key that sorts names with numbers in them by value: 2 before 10."""
     parts = []
@@ -129,7 +150,7 @@ def natural_key(path: Path | str) -> list[tuple[int, str]]:
     return parts
 
 
-def _reader_of(path: Path) -> Callable[[Path, Options], list[Source]] | None:
+def _reader_of(path: Path) -> Callable[[Path, Reading], list[Source]] | None:
     """Return the reader of a file by its suffix; that of dumps by the first line."""
     reader = READERS.get(path.suffix.lower())
     if reader is None and path.is_file():
@@ -142,7 +163,7 @@ def _reader_of(path: Path) -> Callable[[Path, Options], list[Source]] | None:
 # --- arrays ---------------------------------------------------------------------------
 
 
-def as_dataset(arrays: Mapping[str, Any], options: Options) -> xr.Dataset:
+def as_dataset(arrays: Mapping[str, Any], options: Reading) -> xr.Dataset:
     """Return a dataset of arrays without named axes.
 
     The array of positions has the stated axes, others take theirs by their lengths.
@@ -202,18 +223,15 @@ def _split_trajectories(
     return sources
 
 
-def _read_npy(path: Path, options: Options) -> list[Source]:
+def _read_npy(path: Path, options: Reading) -> list[Source]:
     def open_dataset() -> xr.Dataset:
-        try:
-            array = np.load(path, mmap_mode="r")
-        except (ValueError, EOFError, OSError) as error:
-            raise UnreadableFileError(f"{path}: {error}; save it again") from error
-        return as_dataset({"position": array}, Options(axes=options.axes))
+        array = np.load(path, mmap_mode="r")
+        return as_dataset({"position": array}, Reading(axes=options.axes))
 
     return _split_trajectories(path, open_dataset)
 
 
-def _read_npz(path: Path, options: Options) -> list[Source]:
+def _read_npz(path: Path, options: Reading) -> list[Source]:
     if gns_npz.is_pickled(path):
         names = gns_npz.list_trajectories(path)
         return [
@@ -229,7 +247,7 @@ def _read_npz(path: Path, options: Options) -> list[Source]:
     return _split_trajectories(path, open_dataset)
 
 
-def _read_netcdf(path: Path, options: Options) -> list[Source]:
+def _read_netcdf(path: Path, options: Reading) -> list[Source]:
     def open_dataset() -> xr.Dataset:
         engine = "zarr" if path.suffix == ".zarr" else None
         # times stay numbers with units, which say how many seconds they are
@@ -239,7 +257,7 @@ def _read_netcdf(path: Path, options: Options) -> list[Source]:
     return _split_trajectories(path, open_dataset)
 
 
-def _with_axes(dataset: xr.Dataset, options: Options) -> xr.Dataset:
+def _with_axes(dataset: xr.Dataset, options: Reading) -> xr.Dataset:
     """Return a dataset whose dimensions of the positions have the stated names."""
     if options.positions is not None:
         dataset = dataset.rename({options.positions: "position"})
@@ -250,7 +268,7 @@ def _with_axes(dataset: xr.Dataset, options: Options) -> xr.Dataset:
     return dataset
 
 
-def _read_hdf5(path: Path, options: Options) -> list[Source]:
+def _read_hdf5(path: Path, options: Reading) -> list[Source]:
     with h5py.File(path) as file:
         if "VTKHDF" in file:
             frames = partial(vtkhdf.read_frames, path)
@@ -292,7 +310,7 @@ def _open_group(path: Path, group: str, name: str, axes: Sequence[str]) -> xr.Da
         if is_number:
             arrays[key] = dask.array.from_array(item, chunks=chunks, name=False)
     boundary = arrays.pop("boundary", None) if name == "particles" else None
-    dataset = as_dataset(arrays, Options(axes=axes, positions=name))
+    dataset = as_dataset(arrays, Reading(axes=axes, positions=name))
     for key, values in attributes.items():
         if key in dataset:
             dataset[key].attrs.update(values)
@@ -367,7 +385,7 @@ def _holds_one_frame(path: Path) -> bool:
     return read is not None and len(list(islice(read(path), 2))) == 1
 
 
-def _read_frames(path: Path, options: Options) -> list[Source]:
+def _read_frames(path: Path, options: Reading) -> list[Source]:
     read = FRAMES.get(path.suffix.lower(), _lammps_frames)
     return [Source(name=str(path), open=partial(_join, str(path), partial(read, path)))]
 
@@ -536,7 +554,7 @@ FRAMES: dict[str, Callable[[Path], Iterator[Frame]]] = {
 }
 """Readers of the frames of a file, by its suffix."""
 
-READERS: dict[str, Callable[[Path, Options], list[Source]]] = {
+READERS: dict[str, Callable[[Path, Reading], list[Source]]] = {
     ".npy": _read_npy,
     ".npz": _read_npz,
     ".nc": _read_netcdf,

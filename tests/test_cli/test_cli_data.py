@@ -18,7 +18,7 @@ import pytest
 import yaml
 from command_line import Result
 from conftest import SIZE, SPLIT
-from exchange_readers import straight_runs
+from trajectories import straight_runs
 
 import lagbench
 from lagbench.data.registry import load
@@ -117,6 +117,7 @@ def test_list_shows_a_local_split_by_its_folder(run: Run, tmp_path: Path) -> Non
         output=tmp_path / "own",
         radius=0.1,
         frame_interval=0.25,
+        axes="trajectory,frame,particle,space",
     )
     result = run("list", f"{own.folder}/")
     assert result.exit_code == 0
@@ -139,6 +140,7 @@ def test_what_strangers_say_of_a_split_commands_no_terminal(
         output=tmp_path / "own",
         radius=0.1,
         frame_interval=0.25,
+        axes="trajectory,frame,particle,space",
     )
     path = own.folder / "split.yaml"
     description = yaml.safe_load(path.read_text())

@@ -12,8 +12,8 @@ import numpy as np
 import platformdirs
 import pytest
 from command_line import CliRunner
-from exchange_readers import straight_runs
 from scenario_factory import make_key
+from trajectories import straight_runs
 
 import lagbench
 from lagbench.cli.program import app
@@ -167,6 +167,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
         output=folder / "own",
         radius=0.1,
         frame_interval=0.1,
+        axes="trajectory,frame,particle,space",
     )
 
 

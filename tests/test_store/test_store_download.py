@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from command_line import CliRunner
 from conftest import SIZE, SPLIT
-from exchange_readers import straight_runs
 from faulty_server import Mirror, serving
 from numpy.testing import assert_array_equal
 from object_stores import Store, holding
+from trajectories import straight_runs
 
 import lagbench
 from lagbench.cli.program import app
@@ -275,6 +275,7 @@ def test_another_data_set_is_refused_before_files_are_fetched(
         output=here / "other" / "own",
         radius=0.1,
         frame_interval=0.1,
+        axes="trajectory,frame,particle,space",
     )
     of_another = (other.folder / "full/v1/manifest.json").read_bytes()
     for text, error in (
@@ -340,6 +341,7 @@ def test_progress_in_three_dimensions_has_the_true_total_or_none(
         radius=0.1,
         spacing=0.05,
         frame_interval=0.1,
+        axes="trajectory,frame,particle,space",
     )
     root = tmp_path / "root"
     (root / "own").mkdir(parents=True)
