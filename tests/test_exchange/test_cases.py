@@ -118,7 +118,7 @@ def test_times_of_the_file_are_read(tmp_path: Path) -> None:
     for number, save in enumerate((save_uneven, save_squares)):
         folder = tmp_path / str(number)
         folder.mkdir()
-        with pytest.raises(DataError, match="frame 1.*even times"):
+        with pytest.raises(DataError, match=r"frame 1.*even times"):
             adopt_runs(folder, save)
     (tmp_path / "other").mkdir()
     with pytest.raises(UsageError, match=r"0.02 s.*--frame-interval"):
@@ -155,7 +155,7 @@ def test_exchanged_frames_and_particles_are_refused(
         np.savez(tmp_path / f"{subset}.npz", simulation_0=pair)
     metadata = {"bounds": [[0, 1], [0, 1]], "default_connectivity_radius": 0.1}
     (tmp_path / "metadata.json").write_text(json.dumps({**metadata, "dt": 0.1}))
-    with pytest.raises(DataError, match="exchanged|axes have another order"):
+    with pytest.raises(DataError, match=r"exchanged|axes have another order"):
         adopt(tmp_path, output=tmp_path / "own")
 
 
@@ -286,7 +286,7 @@ def test_four_axes_need_their_order(tmp_path: Path) -> None:
         runs = [rng.permutation(vortex(seed, 20), axis=1) for seed in range(10)]
         np.save(path, np.stack(runs, axis=1))
 
-    with pytest.raises(UsageError, match="4 axes.*--axes"):
+    with pytest.raises(UsageError, match=r"4 axes.*--axes"):
         adopt_runs(tmp_path, save, runs=1)
     source = tmp_path / "runs"
     with pytest.raises(DataError, match="rows change their order"):
