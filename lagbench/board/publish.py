@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from lagbench.atomic import move_together, refuse_folders, write_atomically
+from lagbench.atomic import move_together, write_atomically
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring.boards import SUBMISSIONS
@@ -121,7 +121,6 @@ def publish(
                 Path(REFERENCES, entry.split, entry.size),
             ]
         )
-        refuse_folders(removed)
         references = write_references(cards[0], folder)
         _write_journal(staging, moves, removed, folder)
         copies_and_places = []

@@ -33,11 +33,6 @@ from .provenance import TrainingProvenance
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
 
-PREDICTIONS_SIGNS = (b"lagbench_format", b"dataset_sha256")
-"""What tells predictions from other files: scores have no format of data, scenarios no
-hash of the whole data set.
-"""
-
 DIMS = ("scenario", "frame", "particle", "space")
 """Dimensions of ``position``, in this order."""
 

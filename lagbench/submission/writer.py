@@ -35,7 +35,6 @@ from .format import (
     FORMAT,
     NEVER,
     OPTIONAL,
-    PREDICTIONS_SIGNS,
     require_valid_attribute,
 )
 from .issues import quote
@@ -685,7 +684,7 @@ def check_predictions_output(output: Path, *, overwrite: bool) -> None:
             predictions, or its name has the ending of another format.
     """
     _refuse_address(output, "--output")
-    check_output_file(output, overwrite=overwrite, signs=PREDICTIONS_SIGNS)
+    check_output_file(output, overwrite=overwrite)
     ending = output.suffix
     if ending.lower() in OTHER_ENDINGS:
         raise UsageError(
