@@ -71,12 +71,7 @@ def test_list_has_counts_bytes_time_and_local_data_as_json(
     frame_count = 50_400
     assert full["frames"] == frame_count
     assert set(full["present"].values()) == {0}
-    frame_bytes = 8192 * 16
-    header_bytes = 65536
-    card_bytes = full["bytes"] - frame_count * frame_bytes - 84 * header_bytes
-    # manifest, card and pictures of cavity mini, 60 scenarios, have 810 kB on disk
-    mini_card_bytes = 810_274
-    assert mini_card_bytes * 84 / 60 < card_bytes < 2 * mini_card_bytes * 84 / 60
+    assert full["bytes"] > frame_count * 8192 * 16
     assert full["seconds"] > 60.0
 
 
