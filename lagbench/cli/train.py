@@ -72,7 +72,6 @@ def train_command(
         output: Folder of the run; by default in runs/, named after recipe, baseline and
             seed.
         fresh: Start anew and replace an earlier training.
-        processes: Processes of the training, each with its own device.
     """
     require_libraries(TRAINING_LIBRARIES)
     # Torch takes seconds to load, so the data are looked for before. Of several
