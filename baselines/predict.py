@@ -23,7 +23,6 @@ from lagbench.data.layout import expand_home
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.models.output_lock import hold_output
 from lagbench.submission.writer import PredictionsWriter, check_predictions_output
 from lagbench.tensors import Batch
 from lagbench.work.run import Meter, Progress
@@ -188,22 +187,19 @@ def predict(
             parameters=count_parameters(model),
             **_training_attributes(trained, info, settings),
         )
-        with hold_output(output_path):
-            # Another prediction may have written it since the first check.
-            check_outputs(output_path, overwrite=overwrite)
-            solver_seconds_per_frame = _write_rollouts(
-                writer, rollouts, info, time_solver=time_solver, progress=progress
-            )
-            result = _summarise(
-                rollouts,
-                output=output_path,
-                trained_size=trained.info.size,
-                settings=tuple(settings),
-                method=label,
-                device=hardware_label,
-                solver_seconds_per_frame=solver_seconds_per_frame,
-            )
-            _write_costs(result)
+        solver_seconds_per_frame = _write_rollouts(
+            writer, rollouts, info, time_solver=time_solver, progress=progress
+        )
+        result = _summarise(
+            rollouts,
+            output=output_path,
+            trained_size=trained.info.size,
+            settings=tuple(settings),
+            method=label,
+            device=hardware_label,
+            solver_seconds_per_frame=solver_seconds_per_frame,
+        )
+        _write_costs(result)
     return result
 
 

@@ -1,1 +1,1 @@
-"""Models of strangers: ONNX files, checked and run in a child process with limits."""
+"""Models of other code bases: ONNX files, and our architectures trained elsewhere."""

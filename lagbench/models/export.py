@@ -16,23 +16,16 @@ from torch.onnx import symbolic_helper
 from lagbench.atomic import checked_path
 from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import (
-    LagbenchError,
-    UsageError,
-    WorkFailedError,
-    check_installed,
-    require,
-)
+from lagbench.errors import UsageError, check_installed, require
 from lagbench.tensors import Batch
 from lagbench.torch import WindowDataset, check_history, collate
 
-from .onnx_checks import LEAST_OPSET, OUTPUT, SIZE_KEY, SPLIT_KEY
-from .onnx_model import check_onnx
-from .onnx_rollout import open_session
+from .onnx_model import OUTPUT, SIZE_KEY, SPLIT_KEY, check_onnx, open_session
 
 __all__ = ["export_onnx"]
 
 SUFFIX = ".onnx"
+OPSET = 18
 
 MOST_DIFFERENCE = 1e-5
 """Distance between a predicted frame of the model and of its file [length]."""
@@ -79,27 +72,11 @@ def export_onnx(
         UsageError: torch, onnx or onnxruntime is missing, the file has another suffix,
             history is beyond the given frames, the model cannot be traced, or its file
             predicts something else.
-        UnreadableFileError: the file holds what an entry may not carry.
         WorkFailedError: the file cannot be written.
     """
     target = expand_home(path, "export_onnx, path")
     if target.suffix != SUFFIX:
-        raise UsageError(
-            "an ONNX file needs its suffix",
-            where="export_onnx, path",
-            expected=f"a name that ends with {SUFFIX}",
-            got=target.name,
-            fix=f"name it {target.stem or 'model'}{SUFFIX}",
-        )
-    for module in modules:
-        if not isinstance(module, nn.Module):
-            raise UsageError(
-                "modules holds a value that is no network",
-                where="export_onnx, modules",
-                expected="a list of torch.nn.Module",
-                got=f"{type(module).__name__} in it",
-                fix="name the networks whose weights the step uses: modules=[net]",
-            )
+        raise UsageError(f"name the file {target.stem or 'model'}{SUFFIX}")
     check_installed("onnx", extra="onnx")
     data = WindowDataset(
         split, subset="test", size=size, root=root, future=0, registry=registry
@@ -158,7 +135,6 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
 
     Raises:
         UsageError: the step fails, or the exporter does.
-        WorkFailedError: the operating system refused.
     """
     with warnings.catch_warnings(), _sums_of_index_add():
         # the newer exporter needs a package more and writes data beside the file
@@ -171,29 +147,14 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
                 input_names=list(inputs),
                 output_names=[OUTPUT],
                 dynamic_axes=DYNAMIC_AXES,
-                opset_version=LEAST_OPSET,
+                opset_version=OPSET,
                 dynamo=False,
             )
-        except (LagbenchError, MemoryError):
-            raise
-        except OSError as error:
-            raise WorkFailedError(
-                "the model cannot be written",
-                where=str(path),
-                expected="a temporary folder with room",
-                got=error,
-                fix="free disk space, or set TMPDIR to another folder; where the step "
-                "opens files, correct it",
-            ) from error
         except Exception as error:  # the exporter and the step raise any kind
-            reason = str(error).split("\n")[0][:200]
-            names = ", ".join(inputs)
             raise UsageError(
-                "the model cannot be exported",
-                where="export_onnx",
-                expected=f"a step that reads only inputs of this data set: {names}",
-                got=f"{type(error).__name__}: {reason}",
-                fix="name its networks: modules=[net]; use operations that ONNX has",
+                f"the model cannot be exported: {error!r:.200}; use operations that "
+                f"ONNX has, read only {', '.join(inputs)}, and name its networks: "
+                "modules=[net]"
             ) from error
 
 
@@ -234,64 +195,42 @@ def _sums_of_index_add() -> Iterator[None]:
         )
 
     exporter: Any = torch.onnx
-    exporter.register_custom_op_symbolic("aten::index_add", translate, LEAST_OPSET)
+    exporter.register_custom_op_symbolic("aten::index_add", translate, OPSET)
     try:
         yield
     finally:
-        exporter.unregister_custom_op_symbolic("aten::index_add", LEAST_OPSET)
+        exporter.unregister_custom_op_symbolic("aten::index_add", OPSET)
 
 
 def _require_same(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
     """Refuse a file that predicts something else than the model.
 
-    Exporters translate some operations wrongly, without an error. The file runs with
-    the same session options as where an entry is reproduced.
+    Exporters translate some operations wrongly, without an error.
     """
     with torch.no_grad():
         expected = wrapped(*inputs.values()).numpy()
-    frame_shape = (1, *inputs["position"].shape[1:])
-    if expected.shape != frame_shape:
+    if expected.shape != (1, *inputs["position"].shape[1:]):
         raise UsageError(
-            "the model does not predict the positions of the next frame",
-            where="export_onnx, step",
-            expected=f"shape {frame_shape[1:]}: particle, component",
-            got=f"shape {expected.shape[1:]}",
-            fix="return one position of every particle",
+            f"the step returns shape {expected.shape[1:]}; one position of every "
+            "particle is expected"
         )
+    session = open_session(path)
+    values = {}
+    for value in session.get_inputs():
+        values[value.name] = inputs[value.name].numpy()
     try:
-        session, names = open_session(str(path))
-        values = {}
-        for name, tensor in inputs.items():
-            if name in names:
-                values[name] = tensor.numpy()
         (exported,) = session.run([OUTPUT], values)
-    except MemoryError:
-        raise
     except Exception as error:  # onnxruntime raises its own types
-        reason = str(error).split("\n")[0][:200]
-        raise UsageError(
-            "the exported model does not run",
-            where="export_onnx",
-            expected="a model that onnxruntime can run",
-            got=f"{type(error).__name__}: {reason}",
-            fix="replace the operation, or compute in float32 where it has float64",
-        ) from error
+        raise UsageError(f"the exported model does not run: {error!r:.200}") from error
     if exported.shape != expected.shape:
         raise UsageError(
-            "the exported model predicts another number of positions",
-            where="export_onnx",
-            expected=f"shape {expected.shape}",
-            got=f"shape {exported.shape}",
-            fix="let the step do the same operations whenever it is called",
+            f"the exported model predicts shape {exported.shape}, not {expected.shape}"
         )
     difference = float(np.abs(exported - expected).max())
     if not difference <= MOST_DIFFERENCE:
         raise UsageError(
-            "the exported model does not predict what the model does",
-            where="export_onnx",
-            expected=f"positions within {MOST_DIFFERENCE:g}",
-            got=f"a difference of {difference:.2g}",
-            fix="replace the operations that the exporter translates wrongly",
+            f"the exported model predicts positions that differ by {difference:.2g}: "
+            "the exporter translates an operation wrongly"
         )
 
 
@@ -316,29 +255,19 @@ class _Exported(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the next frame, shape [1, particle, axis]."""
         given = dict(zip(self.input_names, inputs, strict=True))
-        position = given["position"]
-        material = given["material"]
-        walls = None
-        if "wall_velocity" in given:
-            walls = given["wall_velocity"][-self.history - 1 :][None]
-        force = None
-        if "body_force" in given:
-            force = given["body_force"][-self.history - 1 :][None]
-        viscosity = None
-        if "viscosity" in given:
-            viscosity = given["viscosity"][None]
-        obstacle = None
-        if "obstacle" in given:
-            obstacle = given["obstacle"][None]
-        values: dict[str, Any] = {
-            "position": position[-self.history :].transpose(0, 1),
-            "sample": torch.zeros_like(material),
-            "material": material,
-            "wall_velocity": walls,
-            "viscosity": viscosity,
-            "body_force": force,
-            "obstacle": obstacle,
-            "scenario": torch.zeros(1, dtype=torch.int64),
-            "frame": torch.zeros(1, dtype=torch.int64),
-        }
-        return self.step(Batch(**values))[None]
+        for name in ("wall_velocity", "body_force"):
+            if name in given:
+                given[name] = given[name][-self.history - 1 :]
+        optional: dict[str, Any] = {}
+        for name in ("wall_velocity", "body_force", "viscosity", "obstacle"):
+            value = given.get(name)
+            optional[name] = None if value is None else value[None]
+        batch = Batch(
+            position=given["position"][-self.history :].transpose(0, 1),
+            sample=torch.zeros_like(given["material"]),
+            material=given["material"],
+            scenario=torch.zeros(1, dtype=torch.int64),
+            frame=torch.zeros(1, dtype=torch.int64),
+            **optional,
+        )
+        return self.step(batch)[None]

@@ -1,47 +1,59 @@
-"""An ONNX model as something that predicts scenarios, without trust in its file.
+"""An ONNX model as something that predicts scenarios; onnxruntime runs it.
 
-The file is parsed and run in child processes (`lagbench.work.machine.run_in_child`)
-with limits on memory, processor time and time of the clock, which may write no file.
+The graph gets some of the inputs :data:`INPUTS`, by name, and returns the next frames,
+at least one, as ``next_position`` [length], shape [frame, particle, axis]. A stranger's
+file is run without limits: run it in a container (docs/reproduce.md).
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from lagbench.data.local import is_split_name
 from lagbench.data.registry import Size
 from lagbench.data.scenario import read_scenario
-from lagbench.errors import (
-    UnreadableFileError,
-    WorkFailedError,
-    check_installed,
-)
+from lagbench.errors import UnreadableFileError, check_regular, require
 from lagbench.references.predictor import given_in
-from lagbench.work.machine import run_in_child
 
-from .formats import require_onnx_bytes
-from .onnx_checks import MOST_BYTES
-from .onnx_rollout import pack, unpack
+INPUTS = (
+    "position",  # given frames and predicted ones, the last input_frames of them
+    "material",
+    "bounds",
+    "periodic",
+    "wall_velocity",  # towards each frame of position and the next one [length/s]
+    "viscosity",
+    "body_force",  # towards each frame of position and the next one [length/s^2]
+    "obstacle",
+    "edges",  # pairs nearer than the connectivity radius, shape [2, edge]
+)
+BY_FRAME = ("wall_velocity", "body_force")
+OUTPUT = "next_position"
+SPLIT_KEY = "lagbench_split"
+SIZE_KEY = "lagbench_size"
+"""Keys of the metadata that state the data set of a model."""
 
-CHECK_SECONDS = 5.0  # processor time of the checks [s]
-LOAD_SECONDS = 10.0  # processor time of imports and of loading a model [s]
-CHECK_MEMORY = 1 << 30  # address space of the checks [bytes]
-MEMORY = 4 << 30  # address space of a rollout [bytes]
-SECONDS_PER_CALL = 3.0  # processor time of loading, and of each call of a model [s]
-LEAST_SECONDS = 1e-6  # processor time of a rollout, which is never nothing [s]
-WALL_FACTOR = 4.0  # time of the clock over processor time, on a busy machine
-START_SECONDS = 600.0
-"""Time of the clock for the start of a child and its checks [s].
+MOST_BYTES = 16_000_000
+"""Longest ONNX file [bytes]."""
 
-Only a child that waits gets that far: what computes too long is stopped by its limit of
-processor time. On a machine that is busy with other work the imports alone may take
-minutes.
+MOST_DISTANCE = 10.0
+"""Farthest that a particle may be from the middle of the box [length], as in a file of
+predictions.
 """
+
+LEAST_SECONDS = 1e-6  # processor time of a rollout, which is never nothing [s]
+
+DTYPES = {
+    "tensor(float)": np.float32,
+    "tensor(double)": np.float64,
+    "tensor(int64)": np.int64,
+    "tensor(bool)": np.bool_,
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,23 +67,96 @@ class OnnxRollout:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnnxModel:
-    """A checked ONNX file, for the data of one split and size."""
+class DeclaredModel:
+    """What an ONNX file declares."""
 
-    path: Path
-    size: Size
-    root: Path  # folder of all data sets
     inputs: tuple[str, ...]  # names of its inputs
     parameters: int  # numbers in its initialisers
-    memory: int = MEMORY
-    seconds_per_call: float = SECONDS_PER_CALL
+    split: str | None  # split that its metadata state
+    size: str | None  # size that its metadata state
+
+
+def check_onnx(path: Path) -> DeclaredModel:
+    """Return what an ONNX file declares.
+
+    Raises:
+        UsageError: onnx or onnxruntime is not installed.
+        UnreadableFileError: the file is no ONNX, has other inputs or outputs than
+            those above, or keeps data outside the file.
+    """
+    onnx = require("onnx", extra="onnx")
+    check_regular(path, longest=MOST_BYTES)
+    try:
+        model = onnx.load(path, load_external_data=False)
+    except Exception as error:  # protobuf raises its own types
+        raise UnreadableFileError("not an ONNX file", where=str(path)) from error
+    tensors = model.graph.initializer
+    if any(tensor.external_data for tensor in tensors):
+        raise UnreadableFileError("it keeps data outside the file", where=str(path))
+    session = open_session(path)
+    inputs = [value.name for value in session.get_inputs()]
+    outputs = [value.name for value in session.get_outputs()]
+    unknown = sorted(set(inputs) - set(INPUTS))
+    if unknown or outputs != [OUTPUT] or "position" not in inputs:
+        raise UnreadableFileError(
+            f"inputs {inputs} and outputs {outputs}; expected are position, any of "
+            f"{INPUTS}, and {OUTPUT}",
+            where=str(path),
+        )
+    stated = session.get_modelmeta().custom_metadata_map
+    return DeclaredModel(
+        inputs=tuple(inputs),
+        parameters=sum(int(np.prod(tensor.dims)) for tensor in tensors),
+        split=stated.get(SPLIT_KEY),
+        size=stated.get(SIZE_KEY),
+    )
+
+
+def open_session(path: Path) -> Any:  # noqa: ANN401 (onnxruntime has no types)
+    """Return a model that is ready to run on one thread."""
+    onnxruntime = require("onnxruntime", extra="onnx")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # onnxruntime raises its own types
+        reason = str(error).split("\n")[0][:200]
+        raise UnreadableFileError(
+            f"onnxruntime cannot load the model: {reason}", where=str(path)
+        ) from error
+
+
+class OnnxModel:
+    """An ONNX file, for the data of one split and size.
+
+    Args:
+        path: the file.
+        size: the split and size to predict.
+        root: folder of all data sets.
+
+    Raises:
+        UsageError: onnx or onnxruntime is not installed.
+        UnreadableFileError: see :func:`check_onnx`.
+    """
+
+    def __init__(self, path: Path, *, size: Size, root: Path) -> None:
+        self.path = path
+        self.size = size
+        self.root = root
+        self.parameters = check_onnx(path).parameters
+        self._session = open_session(path)
+        self._types = {}
+        for value in self._session.get_inputs():
+            self._types[value.name] = DTYPES[value.type]
 
     def predict(
         self, scenario_file: Path, frames: int | None = None
     ) -> NDArray[np.float32]:
         """Return positions of the frames after the given ones [length].
-
-        A rollout that ceases to be finite is frozen.
 
         Args:
             scenario_file: file of the scenario.
@@ -83,8 +168,6 @@ class OnnxModel:
         Raises:
             UnreadableFileError: the model cannot be run, or returns something else than
                 positions.
-            WorkFailedError: it needed more time or memory than allowed, or the machine
-                is too busy.
         """
         return self.roll_out(scenario_file, frames).position
 
@@ -92,61 +175,46 @@ class OnnxModel:
         """Return the processor time of a frame, mean over the first ones [s]."""
         return max(self.roll_out(scenario_file, frames).seconds, LEAST_SECONDS) / frames
 
-    def roll_out(self, scenario_file: Path, frames: int | None = None) -> OnnxRollout:
-        """Return positions and what they took; see :meth:`predict`."""
-        answer = self._run(scenario_file, frames)
-        diverged_at = answer["diverged_at"]
-        if diverged_at is not None:
-            diverged_at += self.size.task.input_frames
-        return OnnxRollout(
-            position=unpack(answer["position"]),
-            seconds=float(answer["seconds"]),
-            diverged_at=diverged_at,
-        )
-
     def close(self) -> None:
-        """Nothing is left open: a child ends with its scenario."""
+        """Nothing is left open."""
 
-    def _run(self, scenario_file: Path, frames: int | None) -> dict[str, Any]:
-        """Return the answer of a child about one scenario."""
+    def roll_out(self, scenario_file: Path, frames: int | None = None) -> OnnxRollout:
+        """Return positions and what they took; see :meth:`predict`.
+
+        A rollout that ceases to be finite, or goes far off, is frozen at its last sound
+        frame.
+        """
         count = frames or self.size.task.horizon
-        request = self._make_request(scenario_file, count)
-        most_calls = count + 1  # the first one is made twice
-        seconds = LOAD_SECONDS + self.seconds_per_call * most_calls
-        answers = run_in_child(
-            "lagbench.models.onnx_rollout.predict_scenario",
-            [request],
-            seconds=seconds,
-            wall=START_SECONDS + WALL_FACTOR * seconds,
-            memory=self.memory,
-        )
-        answers.require_in_time(str(self.path))
-        if not answers.values:
-            raise WorkFailedError(
-                "the model was stopped",
-                where=str(self.path),
-                expected=f"at most {self.seconds_per_call:g} s of processor time per "
-                f"call and {self.memory >> 20} MiB of memory",
-                got=answers.stopped,
-                fix="make the model smaller or faster; see docs/submitting.md",
-            )
-        answer: dict[str, Any] = answers.values[0]
-        if "failed" in answer:
-            raise UnreadableFileError(
-                "the model cannot be run",
-                where=str(self.path),
-                expected="an ONNX model as docs/submitting.md describes it",
-                got=answer["failed"],
-                fix=f"export it for {self.size.split} {self.size.name}, by the options "
-                "split and size of export_onnx, or run it with onnxruntime first",
-            )
-        return answer
+        given = self._read(scenario_file)
+        window = given["position"].astype(np.float64)
+        input_frames = len(window)
+        middle = given["bounds"].mean(axis=1)
+        predicted = np.empty((count, *window.shape[1:]), np.float32)
+        self._advance(given, window, 0)  # the first call compiles and allocates
 
-    def _make_request(self, scenario_file: Path, frames: int) -> dict[str, Any]:
-        """Return what the child process needs to roll a scenario out, ready for JSON.
+        started = time.thread_time()
+        diverged_at = None
+        done = 0
+        while done < count and diverged_at is None:
+            output = self._advance(given, window, done)
+            for frame in output[: count - done]:
+                predicted[done] = frame
+                is_near = np.abs(predicted[done] - middle) <= MOST_DISTANCE
+                if not is_near.all():
+                    last_sound = predicted[done - 1] if done else given["position"][-1]
+                    predicted[done:] = last_sound
+                    diverged_at = input_frames + done
+                    break
+                done += 1
+            window = np.concatenate([window, output])[-input_frames:]
+        seconds = time.thread_time() - started
+        return OnnxRollout(position=predicted, seconds=seconds, diverged_at=diverged_at)
+
+    def _read(self, scenario_file: Path) -> dict[str, NDArray[Any]]:
+        """Return what the scenario gives to a model, by the names of inputs.
 
         The model gets velocities of walls and forces per unit of time, as files have
-        them. :class:`Given` has them per frame.
+        them; :class:`~lagbench.references.predictor.Given` has them per frame.
         """
         with read_scenario(scenario_file) as file:
             given = given_in(file, self.size, self.root)
@@ -159,113 +227,91 @@ class OnnxModel:
             "viscosity": np.asarray(given.viscosity, np.float64),
         }
         if given.body_force is not None:
-            per_square_second = given.body_force / self.size.frame_interval**2
-            arrays["body_force"] = per_square_second
+            arrays["body_force"] = given.body_force / self.size.frame_interval**2
         if given.obstacle is not None:
             arrays["obstacle"] = given.obstacle
-        packed_arrays = {}
-        for name, array in arrays.items():
-            packed_arrays[name] = pack(array)
-        return {
-            "path": str(self.path.absolute()),
-            "frames": frames,
-            "seconds_per_call": self.seconds_per_call,
-            "radius": self.size.task.radius,
-            "arrays": packed_arrays,
-        }
+        return arrays
+
+    def _advance(
+        self, given: dict[str, NDArray[Any]], window: NDArray[np.float64], done: int
+    ) -> NDArray[np.float64]:
+        """Return the next frames, at least one, shape [frame, particle, axis]."""
+        values = {}
+        for name, dtype in self._types.items():
+            if name == "position":
+                value: NDArray[Any] = window
+            elif name == "edges":
+                radius = self.size.task.radius
+                value = find_edges(
+                    window[-1], radius, given["bounds"], given["periodic"]
+                )
+            elif name not in given:
+                raise UnreadableFileError(
+                    f"the model has the input {name}, which {self.size.split} does not "
+                    "have",
+                    where=str(self.path),
+                )
+            elif name in BY_FRAME:
+                # on the way to each frame of the window, and to the next one
+                value = given[name][done : done + len(window) + 1]
+            else:
+                value = given[name]
+            values[name] = np.asarray(value, dtype, order="C")
+        try:
+            (output,) = self._session.run([OUTPUT], values)
+        except Exception as error:  # onnxruntime raises its own types
+            reason = str(error).split("\n")[0][:200]
+            raise UnreadableFileError(
+                f"the model cannot be run: {reason}", where=str(self.path)
+            ) from error
+        if output.ndim != 3 or output.shape[1:] != window.shape[1:] or not len(output):
+            raise UnreadableFileError(
+                f"{OUTPUT} has shape {list(output.shape)}; expected is [frame, "
+                f"{window.shape[1]}, {window.shape[2]}]",
+                where=str(self.path),
+            )
+        return np.asarray(output, np.float64)
 
 
-def open_onnx(
-    path: Path,
-    *,
-    size: Size,
-    root: Path,
-    memory: int = MEMORY,
-    seconds_per_call: float = SECONDS_PER_CALL,
-    declared: DeclaredModel | None = None,
-) -> OnnxModel:
-    """Check an ONNX file and return its model; nothing in it is run yet.
+def open_onnx(path: Path, *, size: Size, root: Path) -> OnnxModel:
+    """Return the model of an ONNX file; see :class:`OnnxModel`."""
+    return OnnxModel(path, size=size, root=root)
+
+
+def find_edges(
+    position: NDArray[np.float64],
+    radius: float,
+    bounds: NDArray[np.float64],
+    periodic: NDArray[np.bool_],
+) -> NDArray[np.int64]:
+    """Return the pairs of particles nearer than a radius, both directions.
+
+    Pairs across a periodic end count. No particle is its own neighbour.
 
     Args:
-        path: the file.
-        size: the split and size to predict.
-        root: folder of all data sets.
-        memory: address space of a rollout [bytes].
-        seconds_per_call: processor time of loading the model, and of each call [s].
-        declared: what :func:`check_onnx` returned for the file; it is called when None.
+        position: positions [length], shape [particle, axis].
+        radius: connectivity radius [length].
+        bounds: ends of the box [length], shape [axis, 2].
+        periodic: whether each axis repeats itself, shape [axis].
 
-    Raises:
-        UsageError: onnx or onnxruntime is not installed.
-        UnreadableFileError: the file is no ONNX, or holds what is not allowed.
-        WorkFailedError: the machine is too busy.
+    Returns:
+        Senders and receivers, ordered by receiver and then sender, shape [2, edge].
     """
-    if declared is None:
-        declared = check_onnx(path)
-    return OnnxModel(
-        path=path,
-        size=size,
-        root=root,
-        inputs=declared.inputs,
-        parameters=declared.parameters,
-        memory=memory,
-        seconds_per_call=seconds_per_call,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class DeclaredModel:
-    """What an ONNX file that passed the checks declares."""
-
-    inputs: tuple[str, ...]  # names of its inputs
-    parameters: int  # numbers in its initialisers
-    split: str | None  # split that its metadata state
-    size: str | None  # size that its metadata state
-
-
-def check_onnx(path: Path) -> DeclaredModel:
-    """Check an ONNX file in a child process; nothing in it is run.
-
-    Raises:
-        UsageError: onnx or onnxruntime is not installed.
-        UnreadableFileError: the file is no ONNX, or holds what is not allowed.
-        WorkFailedError: the machine is too busy.
-    """
-    for package in ("onnx", "onnxruntime"):
-        check_installed(package, extra="onnx")
-    require_onnx_bytes(path, longest=MOST_BYTES)
-    answers = run_in_child(
-        "lagbench.models.onnx_checks.examine",
-        [str(path.absolute())],
-        seconds=CHECK_SECONDS,
-        wall=START_SECONDS,
-        memory=CHECK_MEMORY,
-    )
-    answers.require_in_time(str(path))
-    reason = answers.stopped
-    declared: dict[str, Any] = {}
-    if answers.values:
-        declared = answers.values[0]
-        reason = declared["refused"]
-    if reason is not None:
-        raise UnreadableFileError(
-            "the model is refused",
-            where=str(path),
-            expected="ONNX as docs/submitting.md describes it",
-            got=reason,
-            fix="export the model anew without that",
-        )
-    for name in (declared["split"], declared["size"]):
-        if name is not None and not is_split_name(name):
-            raise UnreadableFileError(
-                "the metadata name no data set",
-                where=str(path),
-                expected="names of a split and a size, such as cavity and mini",
-                got=ascii(name),
-                fix="write the file with export_onnx, or without these metadata",
-            )
-    return DeclaredModel(
-        inputs=tuple(declared["inputs"]),
-        parameters=int(declared["parameters"]),
-        split=declared["split"],
-        size=declared["size"],
-    )
+    if not np.isfinite(position).all():
+        return np.zeros((2, 0), np.int64)
+    low, high = bounds.T
+    lengths = high - low
+    from_low = position - low
+    wrapped = np.where(periodic, np.mod(from_low, lengths), from_low)
+    # scipy refuses points on the upper end of a periodic axis
+    is_at_end = periodic & (wrapped >= lengths)
+    wrapped = np.where(is_at_end, 0.0, wrapped)
+    box_size = None
+    if periodic.any():
+        box_size = np.where(periodic, lengths, 0.0)
+    tree = cKDTree(wrapped, boxsize=box_size)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    edges = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
+    sender, receiver = edges.T
+    order = np.lexsort((sender, receiver))
+    return np.ascontiguousarray(edges[order].T)

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.layout import expand_home
-from lagbench.data.local import SizeLocation, locate
+from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.store.copy import scenario_files
-from lagbench.submission.format import describe_kind, is_name_valid
 from lagbench.submission.writer import (
     PredictionsWriter,
     check_predictions_output,
@@ -19,8 +18,7 @@ from lagbench.submission.writer import (
 from lagbench.work.machine import processor_name
 from lagbench.work.run import Meter, Progress
 
-from .onnx_model import LEAST_SECONDS, DeclaredModel, check_onnx, open_onnx
-from .output_lock import hold_output
+from .onnx_model import LEAST_SECONDS, check_onnx, open_onnx
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +51,7 @@ def predict_onnx(
     time_solver: Callable[[str, str], float | None] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> OnnxPredictionResult:
-    """Predict a subset with an ONNX model, in child processes with limits.
+    """Predict a subset with an ONNX model.
 
     Args:
         model: the ONNX file, docs/submitting.md describes it.
@@ -75,27 +73,36 @@ def predict_onnx(
         progress: called as the work advances.
 
     Raises:
-        UsageError: no such split, size or subset, neither ``split`` nor the file names
-            a split, the file states another split than ``split``, no method may have
-            the name of the file, there is such an output, or onnx is not installed.
-        UnreadableFileError: the model is refused, or cannot be run.
+        UsageError: no such split, size or subset; neither ``split`` nor the file names
+            a split; there is such an output, or onnx is not installed.
+        UnreadableFileError: the model cannot be run.
         DataError: the subset is missing.
-        WorkFailedError: the model needs more time or memory than allowed, or another
-            prediction writes the same output.
     """
     model_path = expand_home(model, "model")
     output_path = expand_home(output, "--output")
     check_predictions_output(output_path, overwrite=overwrite)
     declared = check_onnx(model_path)
-    label = method or _method_of(model_path)
-    any_tier, folder, known = _locate_data_set(
-        split, size, declared, model_path, root=root, registry=registry
-    )
+    if split is None:
+        split = declared.split
+    if split is None:
+        raise UsageError(
+            "the file does not state its split; name it: --split cavity --size mini",
+            where=str(model_path),
+        )
+    if size is None and split == declared.split:
+        size = declared.size
+    any_tier, folder, known = locate(split, size, root=root, registry=registry)
+    if declared.split not in (None, any_tier.split):
+        raise UsageError(
+            f"the model was trained on {declared.split}; leave --split out",
+            where=str(model_path),
+        )
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
-    runner = open_onnx(model_path, size=tier, root=folder, declared=declared)
+    runner = open_onnx(model_path, size=tier, root=folder)
     meter = Meter(progress)
     meter.begin("predicting", total=len(paths), scenarios=len(paths))
+    label = method or model_path.stem
     writer = PredictionsWriter(
         output_path,
         split=tier.split,
@@ -110,22 +117,19 @@ def predict_onnx(
         device=f"{processor_name()}, 1 thread",
     )
     seconds = 0.0
-    with hold_output(output_path):
-        # Another prediction may have written it since the first check.
-        check_predictions_output(output_path, overwrite=overwrite)
-        with writer:
-            for scenario, path in paths.items():
-                rollout = runner.roll_out(path)
-                writer.add(scenario, rollout.position, diverged_at=rollout.diverged_at)
-                seconds += max(rollout.seconds, LEAST_SECONDS)
-                meter.count(1, scenarios=1)
-            seconds_per_frame = seconds / (len(paths) * tier.task.horizon)
-            writer.label(seconds_per_frame=seconds_per_frame)
-            solver_seconds = None
-            if time_solver is not None:
-                solver_seconds = time_solver(tier.split, tier.name)
-            if solver_seconds is not None:
-                writer.label(solver_seconds_per_frame=solver_seconds)
+    with writer:
+        for scenario, path in paths.items():
+            rollout = runner.roll_out(path)
+            writer.add(scenario, rollout.position, diverged_at=rollout.diverged_at)
+            seconds += max(rollout.seconds, LEAST_SECONDS)
+            meter.count(1, scenarios=1)
+        seconds_per_frame = seconds / (len(paths) * tier.task.horizon)
+        writer.label(seconds_per_frame=seconds_per_frame)
+        solver_seconds = None
+        if time_solver is not None:
+            solver_seconds = time_solver(tier.split, tier.name)
+        if solver_seconds is not None:
+            writer.label(solver_seconds_per_frame=solver_seconds)
     return OnnxPredictionResult(
         path=output_path,
         split=tier.split,
@@ -137,87 +141,3 @@ def predict_onnx(
         parameters=runner.parameters,
         solver_seconds_per_frame=solver_seconds,
     )
-
-
-def _method_of(model: Path) -> str:
-    """Return the name of the method that a file is named after.
-
-    Raises:
-        UsageError: no method may have that name.
-    """
-    if is_name_valid(model.stem):
-        return model.stem
-    raise UsageError(
-        "a method cannot have the name of the file",
-        where=f"{model}, --method",
-        expected=describe_kind("method"),
-        got=ascii(model.stem),
-        fix="name the method: --method lines",
-    )
-
-
-def _locate_data_set(
-    split: str | None,
-    size: str | None,
-    declared: DeclaredModel,
-    model: Path,
-    *,
-    root: str | Path | None,
-    registry: Registry | None,
-) -> SizeLocation:
-    """Return the data set to predict, and where it lies.
-
-    Args:
-        split: the named split; that of the file when None.
-        size: the named size.
-        declared: what the file states.
-        model: the file, for messages.
-        root: folder of all data sets.
-        registry: where splits are described.
-
-    Raises:
-        UsageError: no split is named or stated, there is no such data set, or the file
-            states another split than the named one.
-    """
-    chosen_split, chosen_size = _choose_data_set(split, size, declared, model)
-    try:
-        location = locate(chosen_split, chosen_size, root=root, registry=registry)
-    except UsageError as error:
-        if split is not None:
-            raise
-        raise UsageError(
-            error.what,
-            where=f"{model}, the data set that it states",
-            expected=error.expected,
-            got=error.got,
-            fix="name the split, or the folder of a local one: --split",
-        ) from error
-    located_split = location.size.split
-    if declared.split not in (None, located_split):
-        raise UsageError(
-            "the model was trained on another split",
-            where=f"{model}, --split",
-            expected=declared.split,
-            got=located_split,
-            fix="leave --split out, or give the model of this split",
-        )
-    return location
-
-
-def _choose_data_set(
-    split: str | None, size: str | None, declared: DeclaredModel, model: Path
-) -> tuple[str, str | None]:
-    """Return the split and size to predict: the named ones, or else the stated ones."""
-    if split is None:
-        split = declared.split
-    if split is None:
-        raise UsageError(
-            "the ONNX file does not state its split",
-            where=f"{model}, --split",
-            expected="the split that the model predicts",
-            got="nothing",
-            fix="name it: --split cavity --size mini",
-        )
-    if size is None and split == declared.split:
-        size = declared.size
-    return split, size

@@ -67,30 +67,14 @@ def export_safetensors(
         step: steps of the training, below 2^63.
 
     Raises:
-        UsageError: the file has another suffix, no such architecture is installed, or
-            the seed or the step is negative or too large.
-        UnreadableFileError: weights are not finite, the model is of another
-            architecture, or the file is longer than an entry may carry.
+        UsageError: the file has another suffix, or no such architecture is installed.
+        UnreadableFileError: weights are not finite, or the model is of another
+            architecture.
         WorkFailedError: the file cannot be written.
     """
     target = expand_home(path, "export_safetensors, path")
     if target.suffix != SUFFIX:
-        raise UsageError(
-            "a file of safetensors needs its suffix",
-            where="path",
-            expected=f"a name that ends with {SUFFIX}",
-            got=target.name,
-            fix=f"name it {target.stem}{SUFFIX}",
-        )
-    for name, number in (("seed", seed), ("step", step)):
-        if not 0 <= number < 2**63:
-            raise UsageError(
-                f"an impossible {name}",
-                where=name,
-                expected="a whole number from 0 to 2^63 - 1",
-                got=number,
-                fix=f"give the {name} of the training",
-            )
+        raise UsageError(f"name the file {target.stem}{SUFFIX}")
     checkpoint = Checkpoint(
         baseline=baseline,
         options=model.options.model_dump(mode="json"),

@@ -18,7 +18,7 @@ from unittest.mock import Mock
 import netCDF4
 import pytest
 from command_line import CliRunner, Result
-from hostile_onnx import straight_on
+from onnx_files import straight_on
 from turns import of_this_turn
 
 from lagbench.baselines.catalogue import list_names

@@ -37,14 +37,11 @@ from lagbench.baselines.runner import WeightsRunner
 from lagbench.data.registry import Registry
 from lagbench.errors import (
     DataError,
-    LagbenchError,
     UnreadableFileError,
     UsageError,
-    WorkFailedError,
 )
 from lagbench.make.generate import GenerationResult
 from lagbench.submission import validate as examine
-from lagbench.work.run import Progress
 
 Predict = Callable[..., PredictionResult]
 
@@ -746,29 +743,6 @@ def test_predictions_are_not_replaced_in_silence(run: Predict, tmp_path: Path) -
         run(name="predictions.nc", start=2.0)
     assert "--overwrite" in str(caught.value.fix)
     assert (tmp_path / "predictions.nc").read_bytes() == before
-
-
-def test_two_predictions_do_not_write_one_file_at_a_time(
-    run: Predict, tmp_path: Path
-) -> None:
-    """The second is refused at once, whether it may replace files or not."""
-    errors: list[LagbenchError] = []
-
-    def predict_too(news: Progress) -> None:
-        if len(errors) < 2:
-            overwrite = len(errors) > 0
-            with pytest.raises(WorkFailedError) as caught:
-                run(start=0.0, overwrite=overwrite)
-            errors.append(caught.value)
-
-    first = run(start=1.0, progress=predict_too)
-    assert [error.where for error in errors] == [str(first.path)] * 2
-    with netCDF4.Dataset(first.path) as data:
-        position = np.asarray(data["position"][:])
-    assert not np.array_equal(position[:, 0], position[:, 1])
-    files = sorted(path.name for path in tmp_path.iterdir())
-    assert files == ["predictions.json", "predictions.nc", "weights.safetensors"]
-    assert run(start=0.0, overwrite=True).path == first.path
 
 
 CORES = len(os.sched_getaffinity(0))

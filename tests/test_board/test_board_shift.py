@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import yaml
 from command_line import Result
-from hostile_onnx import straight_on
 from model_board import ModelBoard, make_bench
+from onnx_files import straight_on
 
 import lagbench
 from lagbench.baselines.predict import predict

@@ -15,7 +15,7 @@ import netCDF4
 import pytest
 from board_bench import BoardBench, copied, nearer, noisy, still
 from file_size_limit import largest_file
-from hostile_onnx import straight_on
+from onnx_files import straight_on
 from simple_models import INFO, Drift, install
 
 from lagbench.baselines.checkpoint import Checkpoint, load, round_weights, save
