@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lagbench.data.registry import Size
 from lagbench.data.scenario import read_scenario
@@ -297,6 +296,8 @@ def find_edges(
     Returns:
         Senders and receivers, ordered by receiver and then sender, shape [2, edge].
     """
+    from scipy.spatial import cKDTree  # takes long to load
+
     if not np.isfinite(position).all():
         return np.zeros((2, 0), np.int64)
     low, high = bounds.T
