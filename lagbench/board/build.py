@@ -95,6 +95,7 @@ from .verified import read_verified, verification_of
 
 COLUMNS = (
     "vorticity_nrmse",
+    "motion_distance",
     "cloud_distance",
     "vorticity_rmse",
     "mse_avg",

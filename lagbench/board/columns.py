@@ -23,6 +23,7 @@ than a screen.
 
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "position": (
+        "motion_distance",
         "cloud_distance",
         "position_rmse_20",
         "position_rmse",

@@ -296,6 +296,14 @@ class Snapshot:
             for name, particles in members.items()
         }
 
+    @cached_property
+    def velocity_projections(self) -> Mapping[str, NDArray[np.float32]]:
+        """Velocities of each material along fixed directions, sorted [length/frame]."""
+        return {
+            name: sorted_projections(self.velocity[particles])
+            for name, particles in self.scenario.members.items()
+        }
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:

@@ -37,6 +37,7 @@ FORMAT = 1
 
 CURVES = (
     "vorticity_nrmse",
+    "motion_distance",
     "cloud_distance",
     "vorticity_mse",
     "vorticity_rmse",
