@@ -214,11 +214,9 @@ class Batch:
                 frame_numbers = range(self.frames)[frames]
         if not frame_numbers or frame_numbers.step != 1:
             raise UsageError(
-                "a part of a batch has consecutive frames",
+                f"a part of a batch has some of its {self.frames} frames, in steps of "
+                "1, as in batch.part(slice(2))",
                 where="Batch.part",
-                expected=f"a slice of some of {self.frames} frames, in steps of 1",
-                got=repr(frames)[:80],
-                fix="take frames in steps of 1, as in batch.part(slice(2))",
             )
         first = frame_numbers[0]
         wall_velocity = self.wall_velocity
@@ -311,15 +309,9 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
     is_uniform = {len(values) for values in given} <= all_or_none
     if len(lengths) != 1 or not is_uniform:
         raise UsageError(
-            "windows do not fit side by side",
+            "windows do not fit side by side: their lengths or variables differ; "
+            "collate windows of one WindowDataset",
             where="collate",
-            expected="windows of one split and one length",
-            got=f"lengths {sorted(lengths)}, {len(wall_velocities)} of {len(windows)} "
-            f"with moving walls, {len(body_forces)} with a body force, "
-            f"{len(origins)} with their first frame, "
-            f"{len(viscosities)} with a viscosity, {len(obstacles)} with an obstacle, "
-            f"{len(masses)} with a mass, {len(frictions)} with a friction",
-            fix="collate windows of one WindowDataset",
         )
 
     particle_counts = torch.tensor([len(window.material) for window in windows])

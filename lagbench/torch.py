@@ -162,11 +162,9 @@ class WindowSampler(Sampler[int]):
             ranks = group_size
         if not 0 <= rank < ranks <= len(data):
             raise UsageError(
-                "no window for a rank",
+                f"no window for rank {rank} of {ranks}: there are {len(data)}; use "
+                "fewer processes, or more windows",
                 where="WindowSampler",
-                expected=f"0 <= rank < ranks <= {len(data)}",
-                got=f"rank {rank} of {ranks}",
-                fix="use fewer processes, or more windows",
             )
         self.rank = rank
         self.ranks = ranks
@@ -234,11 +232,9 @@ class WindowSampler(Sampler[int]):
         window_count = len(self.data)
         if position > window_count:
             raise UsageError(
-                "no such position",
+                f"no position {position} among {window_count} windows; seek the next "
+                "epoch",
                 where="WindowSampler",
-                expected=f"at most {window_count}",
-                got=position,
-                fix="seek the next epoch",
             )
         self.epoch = epoch
         self.position = position
@@ -263,11 +259,9 @@ class WindowSampler(Sampler[int]):
             if is_mapping:
                 got = ", ".join(map(repr, state)) or "no key"
             raise UsageError(
-                "no state of a sampler",
+                f"no state of a sampler: {got}; give what sampler.state_dict() "
+                "returned",
                 where="WindowSampler.load_state_dict",
-                expected=f"a dictionary with the keys {', '.join(keys)}",
-                got=got,
-                fix="give what sampler.state_dict() returned",
             )
         seed = _check_natural(state["seed"], "seed")
         self.seek(state["epoch"], state["position"])
@@ -290,11 +284,8 @@ def _check_natural(value: object, name: str) -> int:
         number = -1
     if number < 0:
         raise UsageError(
-            f"{name} does not fit",
+            f"{name} is {value!r}; give a whole number from 0",
             where="WindowSampler",
-            expected="a whole number from 0",
-            got=repr(value),
-            fix=f"give such a number as {name}",
         )
     return number
 
@@ -336,11 +327,9 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
             longest = min(longest, forcing.shape[1] - given.frames)
     if not 1 <= frames <= longest:
         raise UsageError(
-            "no such frames",
+            f"{frames} frames cannot be predicted, 1 to {longest} can; give longer "
+            "windows, cut by batch.part(slice(history))",
             where="roll_out",
-            expected=f"1 to {longest}",
-            got=frames,
-            fix="give longer windows, cut by batch.part(slice(history))",
         )
     batch = given
     predicted_frames = []
@@ -372,11 +361,9 @@ def _check_step_result(position: object, last_position: Tensor) -> None:
             got = f"{position.dtype} on {position.device}"
             fix = "return real numbers where the batch lies: .to(batch.position)"
     raise UsageError(
-        "a model returned no positions of the next frame",
+        f"a model returned no positions of the next frame: got {got}, expected "
+        f"{expected}; {fix}",
         where="roll_out, step",
-        expected=expected,
-        got=got,
-        fix=fix,
     )
 
 
@@ -390,11 +377,9 @@ def check_history(history: int | None, given_frames: int, *, where: str) -> int:
         return given_frames
     if not 1 <= history <= given_frames:
         raise UsageError(
-            "a model cannot see that many of the given frames",
+            f"a model cannot see {history} of {given_frames} given frames; leave "
+            f"history out, or give a number from 1 to {given_frames}",
             where=where,
-            expected=f"history from 1 to {given_frames}",
-            got=history,
-            fix=f"leave history out, or give a number from 1 to {given_frames}",
         )
     return history
 
@@ -411,11 +396,9 @@ def _check_device(device: torch.device | str | int) -> torch.device:
     except (RuntimeError, AssertionError, TypeError, ValueError) as error:
         reason = str(error).split("\n")[0][:200]
         raise UsageError(
-            "torch has no such device here",
+            f"torch has no such device here: {str(device)[:80]!r}: {reason}; leave "
+            "device out: the model then runs on the processor",
             where="predict, device",
-            expected="a device of this machine, as in cpu, cuda or cuda:1",
-            got=f"{str(device)[:80]!r}: {reason}",
-            fix="leave device out: the model then runs on the processor",
         ) from error
     return tensor.device
 
@@ -471,11 +454,9 @@ def predict(
         if frame_count < needed_frames:
             tier = data.size
             raise UsageError(
-                "a scenario is too short to be predicted",
+                f"the scenario has {frame_count} of {needed_frames} frames; predict "
+                "the subset test, whose scenarios are long enough",
                 where=f"predict, {tier.split} {tier.name}, scenario {scenario}",
-                expected=f"{needed_frames} frames",
-                got=frame_count,
-                fix="predict the subset test, whose scenarios are long enough",
             )
         # The forcing is given for all frames, unlike the positions.
         _, wall_velocity = data.store.material_and_walls(scenario)
@@ -504,12 +485,10 @@ def _check_finite(
         return
     step, particle, axis = bad_places[0].tolist()
     raise UsageError(
-        "the model returned positions that are not finite",
+        "the model returned positions that are not finite: "
+        f"{positions[step, particle, axis]}; set the network to eval() and check its "
+        "input scaling; a rollout that diverges is frozen at its last finite frame "
+        "and stored with PredictionsWriter.add(..., diverged_at=FRAME)",
         where=f"predict, scenario {scenario}, frame {first_frame + step}, "
         f"particle {particle}",
-        expected="finite positions in every frame",
-        got=positions[step, particle, axis],
-        fix="set the network to eval() and check its input scaling; a rollout that "
-        "diverges is frozen at its last finite frame and stored with "
-        "PredictionsWriter.add(..., diverged_at=FRAME)",
     )

@@ -213,11 +213,10 @@ def demo_board(root: str | Path | None = None) -> Path:
     for entry in board.entries():
         if entry.parts[2] != DEMO_SIZE:
             raise UsageError(
-                "the demo would write into another leaderboard",
+                "the demo would write into another leaderboard: got "
+                f"{entry.as_posix()}, expected entries of size {DEMO_SIZE} only, or "
+                "none; give the demo a folder of its own: --root demo",
                 where=str(board.path),
-                expected=f"entries of size {DEMO_SIZE} only, or none",
-                got=entry.as_posix(),
-                fix="give the demo a folder of its own: --root demo",
             )
     return board.path
 

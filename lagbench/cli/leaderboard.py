@@ -133,19 +133,13 @@ def check_command(
     """
     if (split or size) and not root:
         raise UsageError(
-            "--split and --size choose data to measure again",
+            "--split and --size choose data to measure again; give --root as well",
             where="--root",
-            expected="the folder of the data",
-            got="nothing",
-            fix="give --root as well",
         )
     if recording and not predictions:
         raise UsageError(
-            "there is nothing to record",
+            "there is nothing to record; give --predictions FILE as well",
             where="--record",
-            expected="predictions that are scored again",
-            got="no --predictions",
-            fix="give --predictions FILE as well",
         )
     for path in predictions or ():
         check_regular(path)
@@ -181,11 +175,9 @@ def _sizes_to_measure(root: str, split: str | None, size: str | None) -> list[Si
     sizes = sizes_with_test_files(resolve_root(root), split=split, name=size)
     if not sizes:
         raise DataError(
-            "no test scenarios are there",
+            "no test scenarios are there; make them with `lagbench generate`, or name "
+            "another --root",
             where=str(root),
-            expected="scenarios of the subset test",
-            got="none of the chosen data sets",
-            fix="make them with `lagbench generate`, or name another --root",
         )
     return sizes
 
@@ -245,11 +237,8 @@ def picture_command(
     tier = locate_new(split, size).size
     if output.suffix.lower() != ".svg":
         raise UsageError(
-            "the picture is an SVG file",
+            f"the picture is an SVG file; -o {output.stem or 'cost'}.svg",
             where="--output",
-            expected="a name that ends in .svg",
-            got=output,
-            fix=f"-o {output.stem or 'cost'}.svg",
         )
     check_output_file(output, overwrite=overwrite)
     folder = find_board(board, reads=True)
@@ -303,21 +292,9 @@ def reproduce_command(
         threads: Threads of a model on the CPU.
     """
     if bool(entries) == every:
-        raise UsageError(
-            "name entries, or ask for all",
-            where="ENTRY or --all",
-            expected="one of the two",
-            got="both" if every else "neither",
-            fix="lagbench leaderboard reproduce cavity/mini/gns",
-        )
+        raise UsageError("name entries, as in cavity/mini/gns, or ask for --all")
     if (costs and no_costs) or (scenarios is not None and scenarios < 1):
-        raise UsageError(
-            "the options do not fit together",
-            where="--costs, --no-costs, --scenarios",
-            expected="--costs or --no-costs, and at least one scenario",
-            got="both" if costs and no_costs else f"--scenarios {scenarios}",
-            fix="leave one of the options out, or ask for one scenario or more",
-        )
+        raise UsageError("--costs and --no-costs, or --scenarios 0; leave one out")
     if draw_seed is not None:
         with progress_bar(quiet=quiet or as_json) as progress:
             scores = score_blind(
@@ -461,13 +438,7 @@ def shift_command(
         threads: Threads of a model on the CPU.
     """
     if bool(entries) == every:
-        raise UsageError(
-            "name entries, or ask for all",
-            where="ENTRY or --all",
-            expected="one of the two",
-            got="both" if every else "neither",
-            fix="lagbench leaderboard shift cavity/mini/gns",
-        )
+        raise UsageError("name entries, as in cavity/mini/gns, or ask for --all")
     folder = find_board(board)
     with progress_bar(quiet=quiet or as_json) as progress:
         if not quiet:

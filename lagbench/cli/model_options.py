@@ -31,11 +31,10 @@ def require_libraries(names: tuple[str, ...]) -> None:
     limit = address_space_limit()
     if limit is not None and limit < NEEDED_BYTES:
         raise WorkFailedError(
-            "there is not enough memory",
+            f"there is not enough memory: got {limit >> 20} MiB, expected at least "
+            f"{NEEDED_BYTES >> 20} MiB, for PyTorch and SciPy; raise the limit: "
+            "`ulimit -v unlimited`, or that of the batch system",
             where="the limit on the address space of this process",
-            expected=f"at least {NEEDED_BYTES >> 20} MiB, for PyTorch and SciPy",
-            got=f"{limit >> 20} MiB",
-            fix="raise the limit: `ulimit -v unlimited`, or that of the batch system",
         )
 
 

@@ -89,11 +89,8 @@ def _refuse_choice_of_one(scenario: int | None, frame: int | None) -> None:
     for name, number in (("--scenario", scenario), ("--frame", frame)):
         if number is not None:
             raise UsageError(
-                "a sheet shows many scenarios, at frames that suit the split",
+                f"a sheet shows many scenarios and frames; leave {name} or --sheet out",
                 where=f"--sheet and {name}",
-                expected="one of the two",
-                got=f"--sheet {name} {number}",
-                fix=f"leave {name} out, or leave --sheet out to draw one frame",
             )
 
 

@@ -139,34 +139,23 @@ def _refuse_options_of_weights(
     batch: int | None,
 ) -> None:
     """Refuse options that change nothing for an ONNX file."""
-    given: dict[str, object] = {}
-    if settings:
-        given["--set"] = " ".join(settings)
-    if device not in {"auto", "cpu"}:
-        given["--device"] = device
-    if threads not in {None, 1}:
-        given["--threads"] = threads
-    if batch is not None:
-        given["--batch"] = batch
-    for name, value in given.items():
-        raise UsageError(
-            "an ONNX file has no such option",
-            where=name,
-            expected="one thread of the CPU, a scenario at a time, the model as it is",
-            got=str(value),
-            fix="leave it out",
-        )
+    is_given = {
+        "--set": bool(settings),
+        "--device": device not in {"auto", "cpu"},
+        "--threads": threads not in {None, 1},
+        "--batch": batch is not None,
+    }
+    for name, is_there in is_given.items():
+        if is_there:
+            raise UsageError("not with an ONNX file; leave it out", where=name)
 
 
 def _refuse_stated_seed(seed: int | None) -> None:
     """Refuse a seed for weights, which state the seed of their training."""
     if seed is not None:
         raise UsageError(
-            "weights state the seed of their training",
+            "weights state the seed of their training; leave it out",
             where="--seed",
-            expected="a seed only with an ONNX file",
-            got=str(seed),
-            fix="leave it out",
         )
 
 

@@ -113,12 +113,9 @@ def _check_file_count(predictions: Sequence[Path], report: Path | None) -> None:
     """
     if len(predictions) > 1 and report is None:
         raise UsageError(
-            "several files are scored together for a report only",
+            "several files are scored together for a report only; add --report FOLDER, "
+            "or score one after the other",
             where="FILE",
-            expected="one file, or several with --report FOLDER",
-            got=" ".join(map(str, predictions)),
-            fix="score one after the other; `lagbench compare A.nc B.nc` says which of "
-            "two is better; --report FOLDER draws all of them in one report",
         )
 
 
@@ -165,12 +162,10 @@ def _score_folders(
         other_path = files_by_folder.setdefault(folder.resolve(), path)
         if other_path is not path:
             raise UsageError(
-                "the scores of two files would go to one folder",
+                f"the scores of two files would go to one folder: {other_path} and "
+                f"{path}; name each file once, give the files different names, or "
+                "leave --output out",
                 where=str(folder),
-                expected="a folder for each file",
-                got=f"{other_path} and {path}",
-                fix="name each file once, give the files different names, or leave "
-                "--output out",
             )
     return folders
 
@@ -197,10 +192,9 @@ def _validate_together(
         first = results[0]
         if (result.split, result.size) != (first.split, first.size):
             raise UsageError(
-                "one report, two data sets",
+                f"one report, two data sets: got {result.split} {result.size}, "
+                f"expected {first.split} {first.size}, as in {first.path}; write one "
+                "report for each data set",
                 where=str(path),
-                expected=f"{first.split} {first.size}, as in {first.path}",
-                got=f"{result.split} {result.size}",
-                fix="write one report for each data set",
             )
     return results
