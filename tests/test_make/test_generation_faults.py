@@ -68,7 +68,6 @@ def manifest_of(root: Path) -> Manifest:
         ({"device": "gpu"}, "no device 'gpu'"),
         ({"device": "cuba"}, "did you mean 'cuda'?"),
         *(({"workers": count}, "at least one worker") for count in (0, -1)),
-        ({"workers": "2"}, "a whole number without quotes: workers=2"),
     ],
 )
 def test_wrong_requests_are_refused_before_any_work(

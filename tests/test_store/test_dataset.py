@@ -332,7 +332,6 @@ def test_nothing_stays_open_after_an_error(ragged: Path) -> None:
         ("cavty", "tiny", "test", "did you mean 'cavity'"),
         ("cavity", "tiney", "test", "full or mini or tiny"),
         ("cavity", "tiny", "tset", "did you mean 'test'"),
-        ("cavity", "tiny", ["train"], "subset is of a wrong kind"),
     ],
 )
 def test_unknown_names_offer_the_nearest(
