@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -122,6 +123,7 @@ def adopt(
     if isinstance(sources, str | Path | xr.Dataset):
         sources = [sources]
     listings, stated, text = _list_subsets(sources, reading, valid=valid, test=test)
+    known_kinds = {**stated.pop("kinds", {}), **parse_kinds(kinds)}
     description = _describe({**stated, **options})
     counts = {subset: len(listing.sources) for subset, listing in listings.items()}
     total = sum(counts.values())
@@ -134,9 +136,7 @@ def adopt(
         notes += [f"not read: {', '.join(listing.skipped)}"] if listing.skipped else []
         judged[subset] = []
         for source in listing.sources:
-            judged[subset].append(
-                _judge(source, description, parse_kinds(kinds), notes)
-            )
+            judged[subset].append(_judge(source, description, known_kinds, notes))
             meter.count(1, scenarios=1)
     judgements = {}
     for subset, members in judged.items():
@@ -274,7 +274,14 @@ def _judge(
     def open_trajectory() -> Trajectory:
         with reading(source.name):
             dataset = source.open()
-        return _drop_constant_axes(name_trajectory(dataset, source.name, kinds))
+        trajectory = name_trajectory(dataset, source.name, kinds)
+        if any(description.origin):
+            origin = np.array(description.origin, np.float32)
+            moved = trajectory.dataset["position"] + xr.DataArray(origin, dims="space")
+            trajectory = replace(
+                trajectory, dataset=trajectory.dataset.assign(position=moved)
+            )
+        return _drop_constant_axes(trajectory)
 
     trajectory = open_trajectory()
     name = trajectory.name
@@ -292,7 +299,7 @@ def _judge(
             "correct the file"
         )
     stated = _select_axes(_with_file_box(description, trajectory), trajectory)
-    with trajectory.dataset:
+    with closing(trajectory):
         judgement = judge_trajectory(
             name, trajectory.read(), box=stated.box, frame_interval=interval
         )

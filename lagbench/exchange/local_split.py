@@ -11,6 +11,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -100,7 +101,7 @@ class Description(BaseModel):
     # whether material fills the box, so that vorticity ranks; else clouds rank
     full_box: bool = False
     # what an export of ours took off every position [length]
-    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    origin: tuple[float, ...] = ()
 
     @property
     def box(self) -> Box | None:
@@ -234,7 +235,7 @@ def write_local_split(
         for subset in HASHED_SUBSETS:
             for open_trajectory, spacing in trajectories[subset]:
                 trajectory = open_trajectory()
-                with trajectory.dataset:
+                with closing(trajectory):
                     writer.write_scenario(subset, trajectory, spacing)
                 count()
         manifest = writer.write_descriptions()
@@ -345,8 +346,7 @@ class _Writer:
         ) as writer:
             before: np.typing.NDArray[np.float32] | None = None
             for number, (source_position, velocity) in enumerate(trajectory.read()):
-                origin = np.asarray(self.description.origin)[: self.box.dimension]
-                inside = self.transform.apply(source_position + origin)
+                inside = self.transform.apply(source_position)
                 position = self.box.wrap(inside).astype(np.float32)
                 if velocity is not None:
                     writer.append(position, (velocity / scale).astype(np.float32))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -55,6 +55,7 @@ class Trajectory:
     """A trajectory whose frames are read when asked for."""
 
     name: str  # file, and the trajectory in it
+    close: Callable[[], None]  # closes the file
     dataset: xr.Dataset  # position, perhaps velocity and id, [time, particle, ...]
     material: NDArray[np.int8]  # of each particle that is kept, [particle]
     is_kept: NDArray[np.bool_]  # of all particles, in the order of their ids
@@ -135,12 +136,19 @@ def name_trajectory(
             particle is missing.
         UsageError: a kind has no known material.
     """
+    close = dataset.close
     dataset = _name_dimensions(dataset, name)
     variables = {}
     for purpose, words in NAMES.items():
         found = _find(dataset, words)
         if found is not None:
             variables[purpose] = found
+    if "id" in variables and dataset[variables["id"]].dims == ("particle",):
+        ids = dataset[variables["id"]].values
+        if len(np.unique(ids)) < len(ids):
+            raise DataError(f"{name}: two particles have one id; give each its own")
+        if (np.diff(ids) < 0).any():
+            dataset = dataset.isel(particle=np.argsort(ids))
     position = dataset[variables["position"]]
     if position.dtype.kind not in "fiu":
         raise UnreadableFileError(f"{name}: positions are {position.dtype}, no numbers")
@@ -160,11 +168,8 @@ def name_trajectory(
                 f"{position.shape}; save both alike, or leave velocities out"
             )
         arrays["velocity"] = velocity
-    ids = None
-    if "id" in variables:
-        ids = dataset[variables["id"]]
-        if "time" in ids.dims:
-            arrays["id"] = ids
+    if "id" in variables and "time" in dataset[variables["id"]].dims:
+        arrays["id"] = dataset[variables["id"]]
     ordered = {}
     for key, array in arrays.items():
         wanted = [dim for dim in dims if dim in array.dims]
@@ -173,7 +178,6 @@ def name_trajectory(
     space = _order_components(dataset, name)
     if space is not None:
         kept = kept.isel(space=space)
-    kept.set_close(dataset.close)
 
     material, is_kept, kind_note = _find_materials(
         dataset, variables.get("kind"), arrays.get("id"), kinds, name
@@ -196,6 +200,7 @@ def name_trajectory(
         stated["periodic"] = stated["periodic"].split()
     return Trajectory(
         name=name,
+        close=close,
         dataset=kept,
         material=material,
         is_kept=is_kept,
@@ -377,7 +382,8 @@ def _find_materials(
             raise UsageError(
                 f"{name}: {variable} has the kinds {every}, and no material is known "
                 f"for {value}; state it, as in --kinds {value}={MATERIALS[0]}, or "
-                f"leave these particles out: --kinds {value}={DROP}"
+                f"leave these particles out (walls, which models see as bounds only): "
+                f"--kinds {value}={DROP}"
             )
         code = -1 if word == DROP else MATERIALS.index(word)
         material[values == value] = code

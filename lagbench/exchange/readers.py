@@ -214,7 +214,10 @@ def _split_trajectories(
         count = dataset.sizes[dims[0]]
 
     def open_one(number: int) -> xr.Dataset:
-        return open_dataset().isel({dims[0]: number})
+        dataset = open_dataset()
+        trajectory = dataset.isel({dims[0]: number})
+        trajectory.set_close(dataset.close)
+        return trajectory
 
     sources = []
     for number in range(count):
@@ -596,6 +599,8 @@ def read_metadata(folder: Path) -> dict[str, Any]:
             stated[name] = own.get(name, stated.get(name))
         for name in ("frames_of_interest", "cells", "origin"):
             stated[name] = own.get(name)
+        walls = own.get("wall_particle_type") or ()
+        stated["kinds"] = dict.fromkeys(map(str, walls), "drop")
         if "placement" in own:
             stated["full_box"] = own["placement"] == "cell_centres"
         return {name: value for name, value in stated.items() if value is not None}
