@@ -5,10 +5,11 @@ substeps a frame and r^d times as many particles as the size states. The file ho
 many particles as the size states: one of each r^d, the nearest to the places where the
 run of refinement 1 has its particles at the start. Each stands for the mass of r^d.
 
-The constants that act once a substep follow the substep: a share s of which a particle
-takes over something from the grid becomes s / r, so that the rate s / dt stays. The
+In a full box the constants that act once a substep follow the substep: a share s that a
+particle takes over from the grid becomes s / r, so that the rate s / dt stays. The
 mixing lengths shrink with the cells, so what the solver adds to the equations falls as
-1/r^2.
+1/r^2. On a free surface the shares stay, and it falls as 1/r: J ends at 1 there, and
+the noise that a smaller share leaves in J would push particles apart.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ PER_SUBSTEP = (
     "density_coupling",
     "shift",
 )
-"""Shares of a substep, of which r are taken in place of one."""
+"""Shares of a substep of a full box, of which r are taken in place of one."""
 
 CANDIDATES = 16
 """Particles of the finer run among which the one nearest to a place is chosen."""
@@ -58,7 +59,7 @@ def refined(size: Size, times: int | None = None) -> Size:
             value = factor * size.value(name)
             parameters[name] = parameters[name].model_copy(update={"value": value})
     for name in PER_SUBSTEP:
-        if name in parameters:
+        if name in parameters and size.is_full_box:
             value = size.value(name) / times
             parameters[name] = parameters[name].model_copy(update={"value": value})
     return size.model_copy(update={"parameters": parameters, "subdivision": times})
