@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "draw_noise",
+    "draw_rings",
     "has_rings",
     "initial_state",
     "ring_potential",
@@ -102,7 +103,7 @@ def ring_potential(
     return potential_x, potential_y, potential_z
 
 
-def _draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
+def draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
     """Draw the rings of a scenario."""
     potential = [constant(0.0, len(position), 3) for _ in range(3)]
     for _ in range(size.value("ring_count")):
@@ -136,7 +137,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     if has_rings(scenario):
         kind = "rings"
         frequency = 0
-        flow = _draw_rings(size, rng, position)
+        flow = draw_rings(size, rng, position)
         speed = draw_between(rng, size, "ring_speed")
     else:
         kind = "noise"

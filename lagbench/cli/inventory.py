@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from lagbench.data.box import describe_bounds
 from lagbench.data.layout import (
@@ -15,6 +15,7 @@ from lagbench.data.layout import (
     refuse_closed_folder,
     url_of,
 )
+from lagbench.data.limits import Value
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
 from lagbench.errors import LagbenchError, escape_line, hide_credentials
@@ -258,11 +259,18 @@ def _size_as_json(size: Size, size_overview: Overview) -> dict[str, Any]:
 def _print_parameters(entry: Split, sizes: Sequence[Size]) -> None:
     rows = []
     for name, parameter in entry.parameters.items():
-        values = [size.value(name) for size in sizes]
+        values = [_value_of(size, name) for size in sizes]
         meaning = escape_line(f"[{parameter.unit}] {parameter.description}")
         rows.append((escape_line(name), *values, meaning))
     columns = ("name", *entry.sizes, "[unit] meaning")
     print_table("Parameters", columns, rows)
+
+
+def _value_of(size: Size, name: str) -> Value:
+    """Return a parameter's value; a dash where the size does without."""
+    if name not in size.parameters:
+        return "-"
+    return cast("Value", size.value(name))
 
 
 def _describe_size(size: Size, size_overview: Overview) -> Iterator[str]:

@@ -161,6 +161,7 @@ class Parameter(_RegistryModel):
     # the only subset whose scenarios it concerns and whose files state it; all by
     # default
     subset: str | None = None
+    optional: bool = False  # whether a size may do without a value
 
 
 class ScoreGrid(_RegistryModel):
@@ -556,7 +557,11 @@ class Split(_RegistryModel):
     def _check_sizes(self) -> Split:
         declared = {name: entry.value for name, entry in self.parameters.items()}
         for name, size in self.sizes.items():
-            check_parameters(name, size.parameters, declared)
+            given = dict(declared)
+            for key, parameter in self.parameters.items():
+                if parameter.optional and key not in size.parameters:
+                    del given[key]
+            check_parameters(name, size.parameters, given)
             check_subsets(name, size.subsets, needed=HASHED_SUBSETS)
             task_frames = size.task.input_frames + size.task.horizon
             check_frames(name, size.frames, size.subsets, task_frames=task_frames)
@@ -622,6 +627,8 @@ class Registry:
         parameters = {}
         for key, parameter in parent.parameters.items():
             value = entry.parameters.get(key, parameter.value)
+            if value is None:
+                continue  # an optional one
             parameters[key] = parameter.model_copy(update={"value": value})
         return Size(
             split=split,
