@@ -59,15 +59,6 @@ Report = Callable[[int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationPace:
-    """How long a scenario took for how much, once everything was compiled."""
-
-    seconds: float  # processor time [s]
-    particle_substeps: int  # substeps times particles
-    frames: int  # frames that were advanced to, read out and written
-
-
-@dataclass(frozen=True, kw_only=True)
 class SimulationJob:
     """What a worker simulates in one go; picklable."""
 

@@ -18,8 +18,7 @@ call it ``twin_floor``.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, cast
@@ -37,7 +36,6 @@ from .batch import (
     Report,
     ScenarioBatch,
     SimulationJob,
-    SimulationPace,
     file_parameters,
 )
 from .constants import solver_constants
@@ -59,10 +57,6 @@ STILL = 0.01  # share of its greatest kinetic energy from which on a free surfac
 OUTCOMES = ("active_frames",)
 """Parameters of a file that follow from its simulation; all others are known before it.
 """
-
-# frames on the way to which kernels are compiled: the first is read out, the solver
-# advances to the second
-COMPILING = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +82,6 @@ class SimulatedScenario:
 
     scenario: int  # its id
     content_sha256: str  # content hash of its file
-    pace: SimulationPace | None = None  # of a scenario that was simulated alone
 
 
 def _mass(size: Size, state: InitialState) -> float:
@@ -170,23 +163,14 @@ def active_frames(energies: Sequence[float], task: Task) -> int:
     return max(0, last + 1 - task.input_frames)
 
 
-def simulate(
-    job: SimulationJob,
-    report: Report,
-    *,
-    clock: Callable[[], float] = time.process_time,
-) -> list[SimulatedScenario]:
-    """Simulate the scenarios of a job and write their files, all or none of them.
-
-    Kernels compile on the way to the first two frames, so time is taken from there on.
-    """
+def simulate(job: SimulationJob, report: Report) -> list[SimulatedScenario]:
+    """Simulate the scenarios of a job and write their files, all or none of them."""
     size = job.size
     batch = ScenarioBatch(job, report)
     # of each particle of the run
     masses = [_mass(size, state) / len(state.position) for state in batch.states]
     # kinetic energies by scenario, frame by frame
     energies: list[list[float]] = [[] for _ in masses]
-    started = clock()
     with ExitStack() as stack:
         writers = []
         for scenario, state, recorded in zip(
@@ -196,7 +180,7 @@ def simulate(
             writers.append(stack.enter_context(writer))
 
         recorders = _soundness_recorders(batch)
-        for index, frame in batch.recordings():
+        for index, _ in batch.recordings():
             position, velocity = batch.frame(index)
             recorded = batch.recorded[index]
             stored_velocity = velocity[recorded] if size.stores_velocity else None
@@ -206,8 +190,6 @@ def simulate(
             if recorders:
                 volume_ratio = batch.volume_ratio(index)
                 recorders[index].add(velocity, volume_ratio)
-            if frame == COMPILING - 1:
-                started = clock()
 
         for index, writer in enumerate(writers):
             diagnostics = _diagnose(
@@ -224,22 +206,8 @@ def simulate(
                 soundness = recorders[index].summary(least[index], greatest[index])
                 facts |= asdict(soundness)
             writer.state_facts(facts)
-    seconds = clock() - started
-
-    pace = None
-    timed_frames = size.frame_count(job.scenarios[0]) - COMPILING
-    if timed_frames > 0 and len(job.scenarios) == 1:
-        pace = SimulationPace(
-            seconds=seconds,
-            particle_substeps=timed_frames
-            * batch.size.substeps_per_frame
-            * batch.size.particles,
-            frames=timed_frames,
-        )
     return [
-        SimulatedScenario(
-            scenario=scenario, content_sha256=writer.content_sha256, pace=pace
-        )
+        SimulatedScenario(scenario=scenario, content_sha256=writer.content_sha256)
         for scenario, writer in zip(job.scenarios, writers, strict=True)
     ]
 

@@ -108,10 +108,6 @@ def _describe_default_size(split: str, root: str | Path | None) -> str:
 
 
 def _describe_plan(result: GenerationResult) -> list[str]:
-    if result.measured:
-        source = "at the pace of this machine's last generations"
-    else:
-        source = "estimated; measured after the first generate"
     needed = format_bytes(result.bytes_needed)
     free = format_bytes(result.bytes_free)
     duration = format_seconds(result.seconds_expected)
@@ -121,7 +117,7 @@ def _describe_plan(result: GenerationResult) -> list[str]:
         f"{len(result.kept)} kept",
         f"  disk    at most {needed} ({result.bytes_needed} bytes); "
         f"{free} free in {result.root}",
-        f"  time    about {duration} with {result.workers} workers ({source})",
+        f"  time    about {duration} with {result.workers} workers",
     ]
 
 

@@ -49,6 +49,7 @@ LEGEND = (
     "scenarios: of train/valid/test, then of extra and shift",
     "particles: of the largest scenario; frames: of all scenarios",
     "disk: space that the scenarios need at most",
+    "time: about, on all cores of this machine",
     "here: whether the scenarios are on this machine, or how many of them are",
 )
 """Lines that say what the columns mean."""
@@ -75,8 +76,6 @@ def list_command(
     print_table("", COLUMNS, map(_format_row, overviews))
     for line in LEGEND:
         print_line(line)
-    for line in _describe_times(overviews):
-        print_line(line)
     print_line(
         f"folder of all data sets: {hide_credentials(url_of(folder) or str(folder))}"
     )
@@ -99,7 +98,7 @@ def _list_split(split: str, *, root: str | Path | None, as_json: bool) -> None:
     _print_title(name, entry)
     rows = [_format_row(size_overview)[1:] for size_overview in overviews]
     print_table("", COLUMNS[1:], rows)
-    for line in (*LEGEND, *_describe_times(overviews)):
+    for line in LEGEND:
         print_line(line)
     print_line("")
     print_references(sizes, references)
@@ -146,29 +145,6 @@ def _overviews_of_split(registry: Registry, split: str, folder: Path) -> list[Ov
         except ClosedFolderError as error:
             print_warning(f"{split} {size_name} is left out: {error}")
     return overviews
-
-
-def _describe_times(overviews: Sequence[Overview]) -> list[str]:
-    """Return lines that say where the times of a table come from, if it has any."""
-    estimated_splits: list[str] = []
-    has_measured = False
-    for entry in overviews:
-        if not entry.seconds:
-            continue
-        if entry.measured:
-            has_measured = True
-        elif entry.split not in estimated_splits:
-            estimated_splits.append(entry.split)
-
-    if not estimated_splits:
-        if has_measured:
-            return ["time: at the pace of the last generations of this machine"]
-        return []
-    subject = "time"
-    if has_measured:
-        subject = f"time of {', '.join(estimated_splits)}"
-    line = f"{subject}: estimated; measured after the first generate"
-    return textwrap.wrap(line, TEXT_WIDTH, break_on_hyphens=False)
 
 
 def _format_row(entry: Overview) -> tuple[object, ...]:
@@ -223,8 +199,6 @@ def info_command(
             print_line(line)
     print_line("")
     print_table("Sizes", COLUMNS, map(_format_row, overviews))
-    for line in _describe_times(overviews):
-        print_line(line)
     print_line("")
     _print_parameters(entry, all_sizes)
 

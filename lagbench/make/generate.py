@@ -38,7 +38,6 @@ from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import UsageError, check_installed, suggest_name
 from lagbench.generators.batch import (
     SimulationJob,
-    SimulationPace,
     perturbed_substep_count,
 )
 from lagbench.generators.simulate import (
@@ -69,7 +68,6 @@ from .plan import (
     check_disk,
     estimate,
     free_bytes,
-    note_pace,
     select,
 )
 
@@ -97,8 +95,7 @@ class GenerationResult:
     missing: tuple[int, ...]  # ids of the size that are still not there
     bytes_needed: int  # disk space of 'simulated' before compression [bytes]
     bytes_free: int  # free disk space before the start [bytes]
-    seconds_expected: float  # expected time [s], for reference_seconds
-    measured: bool  # whether it is expected at a rate that this machine has measured
+    seconds_expected: float  # expected time [s], for orientation
     seconds: float = 0.0  # time that it took [s]
     complete: bool = False  # whether train, valid and test are all there
     dataset_sha256: str | None = None  # data set hash, once complete
@@ -214,7 +211,6 @@ def generate(
         bytes_needed=scan.to_do.bytes,
         bytes_free=bytes_free,
         seconds_expected=scan.to_do.seconds(cores),
-        measured=scan.to_do.measured,
         seconds=time.monotonic() - started,
         complete=manifest.complete,
         dataset_sha256=manifest.dataset_sha256,
@@ -252,11 +248,6 @@ class _Setup:
     def folder(self) -> Path:
         """Folder of the data set."""
         return self.size.folder(self.root)
-
-    @property
-    def is_on_cores(self) -> bool:
-        """Whether cores of this machine simulate."""
-        return self.device is Device.CPU and self.scheduler is None
 
     def path(self, scenario: int) -> Path:
         """Return the file of a scenario."""
@@ -364,11 +355,10 @@ def _simulate_missing(
     check_disk(setup.root, scan.to_do.bytes)
     keeper.keep(scan.manifest)
     try:
-        paces = _simulate(setup, keeper, scan)
+        _simulate(setup, keeper, scan)
     finally:
         # The workers are gone by now; what they had not finished goes too.
         remove_leftovers(setup.folder)
-    note_pace(setup.size, paces)
     return scan
 
 
@@ -432,7 +422,7 @@ def _scan_folder(
         manifest=merge_entries(size, base, [*hashed, *stored.values()]),
         hashed=tuple(hashed),
         kept=tuple(kept_ids),
-        to_do=estimate(size, missing_ids, on_cores=setup.is_on_cores),
+        to_do=estimate(size, missing_ids),
     )
 
 
@@ -465,14 +455,8 @@ def _ids_to_inspect(
     return ids
 
 
-def _simulate(
-    setup: _Setup, keeper: _ManifestKeeper, scan: _Scan
-) -> list[SimulationPace]:
-    """Run everything that is to do in workers, and perturbed runs of test scenarios.
-
-    Returns:
-        How fast the cores of this machine were.
-    """
+def _simulate(setup: _Setup, keeper: _ManifestKeeper, scan: _Scan) -> None:
+    """Run everything that is to do in workers, and perturbed runs of test scenarios."""
     size = setup.size
     test_ids = size.subsets.get("test", ())
     # files that are right and have no predictability limit yet
@@ -487,7 +471,7 @@ def _simulate(
     for scenario in unlimited_ids:
         tasks.append(_perturbation_task(setup, scenario))
     if not tasks:
-        return []
+        return
 
     total = 0
     for task in tasks:
@@ -498,7 +482,6 @@ def _simulate(
     scenario_count = len(scan.to_do.scenarios)
     setup.meter.begin("simulating", total=total, scenarios=scenario_count)
 
-    paces: list[SimulationPace] = []
     with _open_team(setup, len(tasks)) as team:
         for task in tasks:
             team.submit(task)
@@ -512,12 +495,9 @@ def _simulate(
             else:
                 _add_simulated(setup, keeper, event)
                 for simulated in event.value:
-                    if setup.is_on_cores and simulated.pace:
-                        paces.append(simulated.pace)
                     if simulated.scenario in test_ids:
                         task = _perturbation_task(setup, simulated.scenario)
                         team.submit(task)
-    return paces
 
 
 def _open_team(setup: _Setup, task_count: int) -> Pool | Cluster:

@@ -77,7 +77,6 @@ class Overview:
     # time to generate on all cores of this machine [s], for orientation; 0 for what
     # cannot be simulated
     seconds: float
-    measured: bool  # whether that is at a rate that this machine has measured
     # scenario files that are there, by subset; 'lagbench verify' checks them. Of a
     # store what its manifest names.
     present: dict[str, int]
@@ -108,11 +107,9 @@ def overview(size: Size, root: Path) -> Overview:
     ids = size.scenarios
 
     seconds = 0.0
-    is_measured = False
     if size.simulated:
         expected = estimate(size, ids)
         seconds = expected.seconds(available_cores())
-        is_measured = expected.measured
 
     present_ids = _present_scenarios(size, root)
     counts: dict[str, int] = {}
@@ -137,7 +134,6 @@ def overview(size: Size, root: Path) -> Overview:
         frames=sum(map(size.frame_count, ids)),
         bytes=size.data_set_bytes(ids),
         seconds=seconds,
-        measured=is_measured,
         present=present,
         folder=folder,
         picture=picture,

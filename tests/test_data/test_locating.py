@@ -31,7 +31,6 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.clean import clean
-from lagbench.make.plan import measured_ratio
 from lagbench.make.verify import verify
 
 
@@ -99,14 +98,6 @@ def test_a_url_is_quoted_without_its_password() -> None:
     assert "bucket/data" in quoted
 
 
-def test_doctor_names_a_root_that_is_a_file_in_its_table(tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.touch()
-    done = CliRunner().invoke(app, ["doctor", "--root", str(file)])
-    assert done.exit_code == 1
-    assert "data folder" in done.stdout
-
-
 def test_a_user_without_a_home_folder_names_the_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,7 +120,6 @@ def test_a_user_without_a_home_folder_names_the_folders(
         resolve_root("s3://bucket/data")
     assert caught.value.where == "LAGBENCH_CACHE"
     assert resolve_root(tmp_path) == tmp_path
-    assert measured_ratio(load().size("cavity", "tiny")) is None
 
 
 def test_an_empty_option_is_not_the_current_folder(
