@@ -14,13 +14,10 @@ import numpy as np
 
 from lagbench.data.layout import format_ids
 from lagbench.data.registry import Size
-from lagbench.errors import suggest_name
 from lagbench.metrics.metric import mean
-from lagbench.references.predictor import Kind
-from lagbench.references.table import references_of
 from lagbench.submission.issues import ValidationIssue
 
-from .entry import RELATIVE_TOLERANCE, Entry, MeasuredCost, Reproduction, Verification
+from .entry import RELATIVE_TOLERANCE, Entry, Reproduction, Verification
 from .fields import latest_date
 from .folder import VERIFIED
 from .issues import make_issue
@@ -50,8 +47,6 @@ def check_line(
     where = f"{VERIFIED}, {entry.yaml_path}"
     yield from _check_dates(line, where)
     is_of_today = is_current(entry.dataset, size)
-    if line.cost is not None and is_of_today:
-        yield from _check_cost(line.cost, size, where)
     if line.is_reproduced:
         yield from _check_level(line, entry, ranking_values, where)
         if is_of_today:
@@ -74,32 +69,6 @@ def _check_dates(line: Verification, where: str) -> Iterator[ValidationIssue]:
                 fix="write the line anew: `lagbench leaderboard reproduce --again`; "
                 "without a model `leaderboard check --predictions FILE --record`",
             )
-
-
-def _check_cost(
-    cost: MeasuredCost, size: Size, where: str
-) -> Iterator[ValidationIssue]:
-    """Yield names of costs that are no reference predictors of the data set."""
-    names_of_kind: dict[Kind, list[str]] = {Kind.CLASSICAL: [], Kind.NAIVE: []}
-    for reference in references_of(size):
-        side = Kind.CLASSICAL if reference.kind.is_on_classical_side else Kind.NAIVE
-        names_of_kind[side].append(reference.name)
-    groups = {
-        "classical": (cost.classical, names_of_kind[Kind.CLASSICAL]),
-        "naive": (cost.naive, names_of_kind[Kind.NAIVE]),
-    }
-    for key, (seconds, names) in groups.items():
-        for name in seconds:
-            if name not in names:
-                short_name = name[:60]
-                yield make_issue(
-                    "verified",
-                    f"{where}, cost.{key}",
-                    ascii(short_name),
-                    what="a cost of no reference predictor",
-                    expected=f"{key} reference predictors of {size.split} {size.name}",
-                    fix=f"remove it; {suggest_name(short_name, names)}",
-                )
 
 
 def _check_level(

@@ -35,6 +35,9 @@ Prediction = Iterator[NDArray[np.float32]]
 Field = Callable[[Floats], Floats]
 """From points [length], shape [point, axis], to velocities there [length/frame]."""
 
+DEGREE = 4
+"""Degree of the polynomials in time through more than two given frames."""
+
 MIRRORED_LAYER = 4.0
 """Depth of the layer that is mirrored at the walls, in spacings of the points."""
 
@@ -203,6 +206,26 @@ def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
         area=mass / float(size.value("density")),
         parameters=file.header.parameters,
     )
+
+
+def fitted_velocity(given: Given, frame: int) -> Floats:
+    """Return the velocity of each particle in a given frame [length/s].
+
+    Through more than two frames goes a polynomial in time, fitted by least squares.
+    Between two the particles fall: they have the mean velocity half-way.
+    """
+    interval = given.size.frame_interval
+    count = len(given.position)
+    steps = given.box.displacement(given.position[:-1], given.position[1:])
+    if count == 2:
+        fall = given.fall if not given.size.is_full_box else 0.0
+        return np.asarray((steps[0] + (frame - 0.5) * fall) / interval)
+    start = np.zeros((1, *steps.shape[1:]))
+    way = np.concatenate([start, np.cumsum(steps, axis=0)])
+    time = np.arange(count) - frame
+    powers = np.vander(time, min(DEGREE, count - 1) + 1, increasing=True)
+    slope = np.linalg.pinv(powers)[1]  # of the polynomial at the frame
+    return np.asarray(np.einsum("f,fpa->pa", slope, way) / interval)
 
 
 def wall_motion(file: ScenarioFile, size: Size, frames: int) -> Floats:

@@ -2,9 +2,9 @@
 
 A textbook solver (:mod:`.staggered`) that is told what a model is told: the given
 frames, the motion of the walls, the body force and the viscosity; in a channel also
-the disc, the stream and the fringe. It starts from the velocities of the last two given
-frames, which hold half a frame before the last one, and brings them there. From then on
-its field carries the particles, two readings a frame (Heun).
+the disc, the stream and the fringe. It starts at the last given frame, from the
+velocities of polynomials in time through all given frames. From then on its field
+carries the particles, two readings a frame (Heun).
 
 It learns nothing. It knows the equations, which are not quite those of the data: their
 fluid is weakly compressible. What a surrogate of a full box must be compared with:
@@ -13,7 +13,8 @@ accuracy against cost (McGreivy and Hakim, Nature Machine Intelligence 6 (2024) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +27,9 @@ from .predictor import (
     Kind,
     Prediction,
     ReferencePredictor,
+    fitted_velocity,
 )
 from .staggered import Forcing, StaggeredGrid
-
-RESOLUTIONS = {"projection": 1, "projection-2x": 2, "projection-3x": 3}
-"""Cells of each solver over those of the score grid, along each axis."""
 
 
 def cell_counts(given: Given, resolution: float) -> tuple[int, ...]:
@@ -59,35 +58,45 @@ def forcing_of(size: Size, obstacle: NDArray[np.floating] | None) -> Forcing | N
     )
 
 
-def predict(given: Given, resolution: float) -> Prediction:
-    """Yield positions that the solver on a grid of some resolution finds.
+@dataclass(frozen=True, kw_only=True)
+class Scheme:
+    """How the equations are integrated."""
+
+    resolution: float  # cells over those of the score grid, along each axis [1]
+    # factor on the upwind part of third-order advection [1]; None for central
+    # differences
+    upwinding: float | None = None
+    viscosity_factor: float = 1.0  # on the stated viscosity [1]
+    radius_factor: float = 1.0  # on the radius within which a body stops the fluid [1]
+
+
+def predict(given: Given, scheme: Scheme) -> Prediction:
+    """Yield positions that the solver finds.
 
     Args:
         given: what is given of the scenario.
-        resolution: cells over those of the score grid [1].
+        scheme: how the equations are integrated.
     """
     interval = given.size.frame_interval
-    viscosity = given.viscosity
+    viscosity = scheme.viscosity_factor * given.viscosity
     walls = given.walls / interval
+    obstacle = given.obstacle
+    if obstacle is not None:
+        obstacle = obstacle.astype(np.float64)
+        obstacle[-1] *= scheme.radius_factor
     grid = StaggeredGrid(
         given.box,
-        cells=cell_counts(given, resolution),
+        cells=cell_counts(given, scheme.resolution),
         no_slip=given.driven,
-        forcing=forcing_of(given.size, given.obstacle),
+        forcing=forcing_of(given.size, obstacle),
+        upwinding=scheme.upwinding,
     )
     first = given.predicted_frames[0]
     forces: Sequence[Floats | None] = [None] * len(walls)
     if given.body_force is not None:
         forces = [*(given.body_force / interval**2)]
     field = grid.from_particles(
-        given.middle, given.step / interval, wall_velocity=walls[first - 1]
-    )
-    field = grid.advance(
-        field,
-        duration=0.5 * interval,
-        viscosity=viscosity,
-        wall_velocity=walls[first - 1],
-        force=forces[first - 1],
+        given.last, fitted_velocity(given, first - 1), wall_velocity=walls[first - 1]
     )
     position = given.last
     for frame in given.predicted_frames:
@@ -111,26 +120,30 @@ def predict(given: Given, resolution: float) -> Prediction:
         yield position.astype("float32")
 
 
-def predict_at(resolution: float) -> Callable[[Given], Prediction]:
-    """Return the predictor of one resolution."""
-
-    def predict_scenario(given: Given) -> Prediction:
-        return predict(given, resolution)
-
-    return predict_scenario
-
-
-def _describe(name: str, resolution: int) -> ReferencePredictor:
+def _describe(name: str, scheme: Scheme) -> ReferencePredictor:
+    advection = "central differences"
+    if scheme.upwinding is not None:
+        advection = "third-order upwind advection"
     return ReferencePredictor(
         name=name,
-        title=f"Projection solver, {resolution} x the score grid",
+        title=f"Projection solver, {advection}, {scheme.resolution:g} x the score grid",
         kind=Kind.CLASSICAL,
-        definition="Incompressible Navier-Stokes on a staggered grid; the width of its"
-        f" cells is that of the cells of the score grid, divided by {resolution}. It"
-        " knows the viscosity and the motion of the walls.",
+        definition=f"Incompressible Navier-Stokes on a staggered grid with {advection};"
+        " the width of its cells is that of the cells of the score grid, divided by"
+        f" {scheme.resolution:g}. It knows the viscosity and what drives the flow.",
         applies=lambda size: size.is_full_box,
-        predict=predict_at(resolution),
+        predict=lambda given: predict(given, scheme),
     )
 
 
-PREDICTORS = tuple(_describe(*item) for item in RESOLUTIONS.items())
+SCHEMES = {
+    "projection": Scheme(resolution=1),
+    "projection-2x": Scheme(resolution=2),
+    "projection-3x": Scheme(resolution=3),
+    "upwind": Scheme(resolution=1, upwinding=1.0),
+    "upwind-2x": Scheme(resolution=2, upwinding=1.0),
+    "upwind-3x": Scheme(resolution=3, upwinding=1.0),
+}
+"""Scheme of each row."""
+
+PREDICTORS = tuple(_describe(name, scheme) for name, scheme in SCHEMES.items())

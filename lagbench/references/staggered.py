@@ -69,6 +69,8 @@ class StaggeredGrid:
         cells: cells along each axis, shape [axis].
         no_slip: whether walls hold the fluid; else it slides along them.
         forcing: what draws the velocity at the faces to given values; None for nothing.
+        upwinding: factor on the upwind part of third-order advection [1]: 1 of Leonard,
+            3 of Kawamura and Kuwahara; None for central differences of second order.
     """
 
     def __init__(
@@ -78,9 +80,11 @@ class StaggeredGrid:
         cells: Sequence[int],
         no_slip: bool,
         forcing: Forcing | None = None,
+        upwinding: float | None = None,
     ) -> None:
         self.box = box
         self.forcing = forcing
+        self.upwinding = upwinding
         self.cells = tuple(cells)
         self.no_slip = no_slip
         self.spacing = box.lengths / np.asarray(self.cells)
@@ -196,7 +200,8 @@ class StaggeredGrid:
         for component, ghosted in enumerate(padded):
             rate = viscosity * self._laplacian(ghosted)
             for axis in range(self.dimension):
-                rate -= self._flux_divergence(padded, component, axis)
+                flux = self._flux(padded, component, axis, wall_velocity)
+                rate -= np.diff(flux, axis=axis) / self.spacing[axis]
             if force is not None:
                 rate += self._force_at_faces(np.asarray(force), component)
             self._stop_at_walls(rate, component)
@@ -231,31 +236,45 @@ class StaggeredGrid:
     def _with_ghosts(
         self, values: Floats, component: int, wall_velocity: Floats
     ) -> Floats:
-        """Return a component with one more layer on each side of every axis.
+        """Return a component with one more layer on each side of every axis."""
+        padded = values
+        for axis in range(self.dimension):
+            padded = self._extend(padded, component, axis, wall_velocity, layers=1)
+        return padded
+
+    def _extend(
+        self,
+        values: Floats,
+        component: int,
+        axis: int,
+        wall_velocity: Floats,
+        *,
+        layers: int,
+    ) -> Floats:
+        """Return a component with ghost layers at both ends of an axis.
 
         Across a wall stands the mirror image: ``2 u_wall - u`` where it holds the
         fluid, u where it slides, -u for the component that the wall stops.
         """
-        padded = values
-        for axis in range(self.dimension):
-            first = _slice(self.dimension, axis, None, 1)
-            last = _slice(self.dimension, axis, -1, None)
-            if self.box.periodic[axis]:
-                layers = (padded[last], padded, padded[first])
-            elif axis == component:
-                below = -padded[_slice(self.dimension, axis, 1, 2)]
-                above = -padded[_slice(self.dimension, axis, -2, -1)]
-                layers = (below, padded, above)
-            elif self.no_slip:
-                low_wall = wall_velocity[2 * axis, component]
-                high_wall = wall_velocity[2 * axis + 1, component]
-                below = 2.0 * low_wall - padded[first]
-                above = 2.0 * high_wall - padded[last]
-                layers = (below, padded, above)
-            else:
-                layers = (padded[first], padded, padded[last])
-            padded = np.concatenate(layers, axis)
-        return padded
+        dimension = self.dimension
+        if self.box.periodic[axis]:
+            low = values[_slice(dimension, axis, -layers, None)]
+            high = values[_slice(dimension, axis, None, layers)]
+            return np.concatenate((low, values, high), axis)
+        # the component that the wall stops has its own face in the mirror
+        mirror = 1 if axis == component else 0
+        low = values[_slice(dimension, axis, mirror, mirror + layers)]
+        end = values.shape[axis] - mirror
+        high = values[_slice(dimension, axis, end - layers, end)]
+        low = np.flip(low, axis)
+        high = np.flip(high, axis)
+        if axis == component:
+            low = -low
+            high = -high
+        elif self.no_slip:
+            low = 2.0 * wall_velocity[2 * axis, component] - low
+            high = 2.0 * wall_velocity[2 * axis + 1, component] - high
+        return np.concatenate((low, values, high), axis)
 
     def _laplacian(self, padded: Floats) -> Floats:
         """Return the Laplacian of a component that is padded with ghosts.
@@ -272,32 +291,42 @@ class StaggeredGrid:
             total += change / self.spacing[axis] ** 2
         return total
 
-    def _flux_divergence(self, padded: Velocity, component: int, axis: int) -> Floats:
-        """Return ``d(u_component u_axis) / d axis`` at the faces of the component.
+    def _flux(
+        self, padded: Velocity, component: int, axis: int, wall_velocity: Floats
+    ) -> Floats:
+        """Return ``u_component u_axis`` half a cell before and after each face.
 
-        The two velocities meet half a cell below and half a cell above each face: in
-        cells where the axis is the component's own, else on edges.
+        There the two velocities meet: in cells where the axis is the component's own,
+        else on edges. The carrier is a mean of two values. The carried value is one
+        too; or, with upwinding a, that of fourth order less an upwind part,
+
+            (-u_0 + 7 u_1 + 7 u_2 - u_3) / 12
+                + a sign(carrier) (u_3 - 3 u_2 + 3 u_1 - u_0) / 12.
+
+        Its row i along the axis lies on the lower side of the component's row i.
         """
         dimension = self.dimension
-        carried = padded[component]
-        core = (slice(1, -1),) * dimension
-        below = carried[_neighbour(dimension, axis, -1)]
-        above = carried[_neighbour(dimension, axis, +1)]
-        here = carried[core]
-        carried_below = 0.5 * (below + here)
-        carried_above = 0.5 * (here + above)
+        narrow = list((slice(1, -1),) * dimension)
+        narrow[axis] = slice(None)
+        carried = padded[component][tuple(narrow)]
+        below = carried[_slice(dimension, axis, None, -1)]
+        above = carried[_slice(dimension, axis, 1, None)]
+        total = below + above
         if axis == component:
-            flux_below = carried_below**2
-            flux_above = carried_above**2
+            carrier = 0.5 * total
         else:
             carrier = self._at_edges(padded[axis], axis=axis, component=component)
-            count = here.shape[axis]
-            lower = _slice(dimension, axis, None, count)
-            upper = _slice(dimension, axis, 1, count + 1)
-            flux_below = carried_below * carrier[lower]
-            flux_above = carried_above * carrier[upper]
-        change = flux_above - flux_below
-        return np.asarray(change / self.spacing[axis])
+            count = total.shape[axis]
+            carrier = carrier[_slice(dimension, axis, None, count)]
+        if self.upwinding is None:
+            return carrier * (0.5 * total)
+        core = carried[_slice(dimension, axis, 1, -1)]
+        wide = self._extend(core, component, axis, wall_velocity, layers=2)
+        farther_below = wide[_slice(dimension, axis, None, -3)]
+        farther_above = wide[_slice(dimension, axis, 3, None)]
+        mean = 7.0 * total - farther_below - farther_above
+        upwind = farther_above - farther_below - 3.0 * (above - below)
+        return (carrier * mean + self.upwinding * np.abs(carrier) * upwind) / 12.0
 
     def _at_edges(self, padded: Floats, *, axis: int, component: int) -> Floats:
         """Return u_axis half a cell before the faces of another component.

@@ -12,10 +12,10 @@ from . import (
     analog_barycentre,
     ballistic_analog,
     climatology,
-    coarse_solver,
     extrapolation,
     frozen_field,
     projection,
+    restarted,
 )
 from .predictor import Kind, ReferencePredictor
 
@@ -28,7 +28,7 @@ _PREDICTORS = (
     analog.PREDICTOR,
     ballistic_analog.PREDICTOR,
     *projection.PREDICTORS,
-    *coarse_solver.PREDICTORS,
+    *restarted.PREDICTORS,
     analog_barycentre.PREDICTOR,
 )
 
