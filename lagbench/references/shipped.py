@@ -30,8 +30,6 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import available
 
-from .table import REFERENCES
-
 FOLDER = Path(__file__).parent / "measured"
 
 FORMAT = 1
@@ -99,16 +97,13 @@ def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
 def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, ReferenceScores] | None:
     """Return the scores of the references of a split and size, by name.
 
-    None where none were measured on the data set that the registry describes. A row
-    that is no reference any more is left out.
+    None where none were measured on the data set that the registry describes.
     """
     content = _read(size, folder)
     if content is None:
         return None
     references = {}
     for name, record in content["floors"].items():
-        if name not in REFERENCES:
-            continue
         references[name] = ReferenceScores(
             name=name,
             scores=_scores_in(record, content),
