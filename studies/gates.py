@@ -52,7 +52,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.figures.tables import escape
 from lagbench.tensors import Batch
 
-from .thesis.split_results import BOARD
+BOARD = Path("leaderboard")
 
 Floats = NDArray[np.float64]
 

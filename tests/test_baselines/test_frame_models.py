@@ -33,7 +33,8 @@ from lagbench.data import grid as gridding
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
-from studies.thesis.published import MLP_STUDIES, MLPStudy
+from studies.published import MLP_STUDIES, MLPStudy
+from studies.thesis import recipe_of
 
 SCENARIOS = rotations(4)
 INFO = info_of(SCENARIOS)
@@ -54,18 +55,6 @@ def window_of(scenario: int, frames: slice) -> Batch:
     return batch_of([SCENARIOS[scenario][frames]])
 
 
-def recipe_variant(study: MLPStudy) -> str:
-    """Return the recipe of a row of the thesis's tables."""
-    # What tells the recipe of a row from the others of its table.
-    distinctions = {
-        "4.2": study.activation,
-        "4.3": study.widths[0],
-        "4.4": len(study.widths),
-        "4.5": study.row,
-    }
-    return f"table-{study.table}-{distinctions[study.table]}"
-
-
 @pytest.mark.parametrize(
     "study",
     MLP_STUDIES,
@@ -76,7 +65,7 @@ def test_parameters_of_the_thesis(study: MLPStudy) -> None:
     split = "multimaterial"
     if study.table < "4.4":
         split = "fluid"
-    variant = recipe_variant(study)
+    variant = recipe_of(study)
     recipe = recipe_for(find("mlp"), split, "full", variant=variant)
     with torch.device("meta"):  # no memory for the weights
         model = MLP.build(recipe.model, FULL_INFO)

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import sys
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -30,8 +25,6 @@ from lagbench.baselines.var import (
     solve,
 )
 from lagbench.errors import WorkFailedError
-from lagbench.make.generate import GenerationResult
-from studies.thesis import var_protocol
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -400,75 +393,3 @@ def test_principal_directions_are_those_of_the_svd() -> None:
     leading = right[:10].T
     overlap = np.abs(directions.T @ leading)
     assert_allclose(overlap, np.eye(10), atol=1e-6)
-
-
-def test_a_forecast_grows_by_its_eigenvalue() -> None:
-    """z(f) = 2 z(f-1) grows by 2 per frame, and its errors against 0 are 4^f / 2.
-
-    Past overflow they are infinite.
-    """
-    coefficients = np.array(
-        [
-            [0.0, 0.0],
-            [2.0, 0.0],
-            [0.0, 0.5],
-        ]
-    )
-    last = np.array([[1.0, 0.0]], np.float32)
-    truth = np.zeros((30, 2), np.float32)
-    errors, growth = var_protocol.forecast_errors(coefficients, last, truth)
-    frames = np.arange(1, 31)
-    assert_allclose(errors, 4.0**frames / 2)
-    assert growth == pytest.approx(2.0)
-
-    long_truth = np.zeros((600, 2), np.float32)
-    errors, _ = var_protocol.forecast_errors(coefficients, last, long_truth)
-    assert np.isinf(errors[-1])
-
-
-@pytest.mark.parametrize("factor", [1e152, 1e200])
-def test_a_forecast_that_overflows_at_once_diverges(factor: float) -> None:
-    """Then it has no growth from frame to frame."""
-    result: dict[str, Any] = {}
-    for field in dataclasses.fields(var_protocol.ProtocolResult):
-        result[field.name] = 1.0
-    coefficients = np.array([[0.0], [factor]])
-    last = np.ones((1, 1), np.float32)
-    truth = np.zeros((3, 1), np.float32)
-    errors, growth = var_protocol.forecast_errors(coefficients, last, truth)
-    assert np.isnan(growth)
-    result |= {"mse_at": {}, "growth": growth, "forecast_mse": float(errors.mean())}
-    (note,) = var_protocol.beside_thesis(result).notes
-    assert "The forecast diverges" in note
-
-
-def test_the_protocol_of_the_thesis_runs(
-    generated: GenerationResult,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """It fits 70 % of all frames and forecasts 15 %, beside the thesis's values."""
-    arguments = [
-        "--split",
-        generated.split,
-        "--size",
-        generated.size,
-        "--root",
-        str(generated.root),
-        "--json",
-    ]
-    monkeypatch.setattr(sys, "argv", ["var_protocol", *arguments])
-    assert var_protocol.main() == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["features"] == 4 * 506
-    assert result["frames"] == 91
-    assert result["forecast_frames"] == 19
-    # There are fewer frames than features, so that the fit meets every one.
-    assert result["fit_mse"] < 1e-9
-
-    mse_at = {}
-    for frame, value in result["mse_at"].items():
-        mse_at[int(frame)] = value
-    fields = result | {"mse_at": mse_at}
-    protocol_result = var_protocol.ProtocolResult(**fields)
-    assert "| 3.5e+18 |" in var_protocol.result_markdown(protocol_result)

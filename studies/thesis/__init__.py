@@ -1,1 +1,0 @@
-"""The tables and figures of D. Dharma's thesis (Leeds, 2025) beside our own."""
