@@ -85,6 +85,8 @@ def render(measured: Mapping[str, Mapping[str, Measured]]) -> str:
 
 def _render_size(values: Measured) -> list[str]:
     lines = [f'      dataset_sha256: "{values.dataset_sha256}"']
+    if values.truth_error is not None:
+        lines.append(f"      truth_error: {_format_number(values.truth_error)}")
 
     lines.append("      subset_sha256:")
     for subset, digest in values.subset_sha256.items():
@@ -172,6 +174,9 @@ def record(
             fix="raise MAJOR of the split, or pass --allow-change before a release",
         )
 
+    if old_hash == values.dataset_sha256 and size.measured is not None:
+        kept = {"truth_error": size.measured.truth_error}
+        values = values.model_copy(update=kept)
     old_measured = load(registry).measured
     old_sizes = old_measured.get(size.split, {})
     sizes = {**old_sizes, size.name: values}

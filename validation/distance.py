@@ -20,6 +20,7 @@ def error_between(
     truth: Array,
     *,
     given: Array,
+    previous: Array | None = None,
     material: NDArray[np.int8],
     area: float,
 ) -> float:
@@ -31,6 +32,8 @@ def error_between(
             axis].
         truth: the same of the run that counts as true.
         given: the given frames of that run, shape [frame, particle, axis].
+        previous: positions of the prediction in the last given frame, where they are
+            not those of the truth [length], shape [particle, axis].
         material: index into MATERIALS, shape [particle].
         area: area or volume that the particles cover [length^d].
     """
@@ -58,7 +61,7 @@ def error_between(
     rows = zip(
         frames,
         snapshots(scenario, truth),
-        snapshots(scenario, prediction),
+        snapshots(scenario, prediction, previous=previous),
         strict=True,
     )
     pairs = (FramePair(scenario, *row) for row in rows)

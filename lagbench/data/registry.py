@@ -198,6 +198,9 @@ class Measured(_RegistryModel):
     # position RMSE of a slightly perturbed run per predicted frame, mean over test
     # [length]
     twin_floor: tuple[float, ...] = Field(strict=False)
+    # ranking metric between the truth and a run with twice its refinement, mean over
+    # three scenarios of test
+    truth_error: float | None = None
 
 
 LARGEST_END = 1e6  # greatest distance of an end of a box from 0 [length]
