@@ -19,6 +19,7 @@ from lagbench.data.limits import Value
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
 from lagbench.errors import LagbenchError, escape_line, hide_credentials
+from lagbench.make.cards import describe_truth_error
 from lagbench.make.inventory import Overview, overview
 
 from .options import JsonFlag, RootOption
@@ -227,6 +228,8 @@ def _size_as_json(size: Size, size_overview: Overview) -> dict[str, Any]:
         "periodic": size.periodic,
         "dt": size.dt,
         "frame_interval": size.frame_interval,
+        "refinement": size.refinement,
+        "truth_error": size.truth_error,
     }
 
 
@@ -261,6 +264,9 @@ def _describe_size(size: Size, size_overview: Overview) -> Iterator[str]:
     yield (
         f"  frame      {size.frame_interval:.6g} s, "
         f"{size.substeps_per_frame} substeps of {size.dt:.6g} s"
+    )
+    yield (
+        f"  truth      refinement {size.refinement}, error {describe_truth_error(size)}"
     )
     yield f"  box        {describe_bounds(size.bounds, size.periodic)}"
     yield f"  hash       {size_overview.dataset_sha256 or 'not measured yet'}"

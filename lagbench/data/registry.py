@@ -492,6 +492,13 @@ class Size(BaseModel):
         )
 
     @property
+    def truth_error(self) -> float | None:
+        """How far the truth is from a run twice as fine, in the metric that ranks."""
+        if self.measured is None:
+            return None
+        return self.measured.truth_error
+
+    @property
     def stores_velocity(self) -> bool:
         """Whether generated files hold the solver's velocities.
 

@@ -217,6 +217,16 @@ def _yaml_value(value: object) -> str:
     return "".join(characters)
 
 
+def describe_truth_error(size: Size) -> str:
+    """Return how far the truth is from a run twice as fine, in the metric that ranks.
+
+    The metrics are not loaded for its name.
+    """
+    if size.truth_error is None:
+        return "not measured"
+    return f"{size.truth_error:.4g} in the metric that ranks"
+
+
 def _summary_table(size: Size, manifest: Manifest) -> str:
     data_hash = "none before it is complete"
     if manifest.dataset_sha256:
@@ -254,6 +264,8 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
         ("particles", particle_range),
         ("frame interval", f"{size.frame_interval:.6g} s"),
         ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
+        ("refinement of the solver", size.refinement),
+        ("truth error", describe_truth_error(size)),
         ("box", " x ".join(sides)),
         ("periodic axes", ", ".join(size.periodic) or "none"),
         ("bytes", byte_count),

@@ -181,7 +181,8 @@ def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
     for scenario, count in zip(scenarios, substeps, strict=True):
         if size.subset_of(scenario) == "test":
             omitted_frames = size.frames_after_horizon(scenario)
-            total_substeps += count - omitted_frames * size.substeps_per_frame
+            omitted_substeps = omitted_frames * size.substeps_per_frame
+            total_substeps += count - omitted_substeps * size.refinement
             total_frames += size.frame_count(scenario) - omitted_frames
 
     particles = size.particles * size.refinement**size.dimension
