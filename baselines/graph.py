@@ -1,15 +1,7 @@
 """Neighbour search, and the features of a graph network's nodes and edges.
 
-The search returns every pair of particles within a radius, exactly, on CPU and GPU. A
-pair is connected where, in float64 of the positions as they are stored,
-
-    (x_i - x_j)^2 + (y_i - y_j)^2 <= radius^2.
-
-Particles are sorted by square cells a little wider than the radius. In the order
-(column, row) the cells above a particle's own, and the three beside it in the next
-column, are two runs of consecutive particles. Only their distances have to be computed.
-NumPy does this on the CPU, torch elsewhere, with the same roundings: they agree to the
-last edge.
+A k-d tree of scipy finds every pair of particles within a radius, exactly, in float64
+of the positions as they are stored; positions on a GPU make the way to the CPU.
 
 A graph network sees motion, walls and material of a particle, and the places of its
 neighbours. It sees differences of positions only, so that away from walls the features
@@ -20,12 +12,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree, cKDTree
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from lagbench.data.box import UNIT_SQUARE, Box
@@ -36,11 +27,6 @@ from .deviations import replace_zeros
 
 Bounds = Sequence[tuple[float, float]]
 """Low and high end of the box along each axis."""
-
-# cells are wider than the radius by this share, more than rounding can move a particle
-MARGIN = 1e-6
-# number of cells on either side of the origin; all particles beyond lie in the last one
-FAR = 1 << 20
 
 
 @torch.no_grad()
@@ -69,228 +55,36 @@ def radius_graph(
         sample: window of each particle, ascending, shape [particle].
         self_edges: whether each particle is its own neighbour too.
         most: neighbours of a receiver at most, the nearest; of equally far ones any.
-        box: box that holds the particles. With three dimensions or periodic axes a
-            k-d tree on the CPU finds the pairs, by their shortest distance.
+        box: box that holds the particles; across periodic axes the shortest distance
+            counts.
 
     Raises:
         UsageError: shapes do not fit, or the radius is no positive number.
     """
-    _check_search(position, radius, sample, dimension=box.dimension)
+    if position.shape[1:] != (box.dimension,) or not 0.0 < radius < math.inf:
+        raise UsageError(
+            f"positions of shape {tuple(position.shape)} and radius {radius}; expected "
+            f"are [particle, {box.dimension}] and a length"
+        )
     x = position.detach().double()
     if sample is None:
         window = torch.zeros(len(x), dtype=torch.int64, device=x.device)
     else:
         window = sample
 
-    if box.dimension != 2 or box.is_periodic:
-        x_array = x.cpu().numpy()
-        window_array = window.cpu().numpy()
-        numbers = tree_edges(
-            x_array,
-            window_array,
-            radius,
-            box=box,
-            self_edges=self_edges,
-            most=most,
-        )
-        numbers.sort()
-        edges = torch.from_numpy(numbers).to(x.device)
-    elif most is not None:
-        x_array = x.cpu().numpy()
-        window_array = window.cpu().numpy()
-        numbers = nearest_edges(x_array, window_array, radius, self_edges, most)
-        numbers.sort()
-        edges = torch.from_numpy(numbers).to(x.device)
-    elif x.device.type == "cpu":
-        x_array = x.numpy()
-        window_array = window.numpy()
-        numbers = edge_numbers(np, x_array, window_array, radius, self_edges)
-        numbers.sort()
-        edges = torch.from_numpy(numbers)
-    else:
-        unsorted_edges = edge_numbers(torch, x, window, radius, self_edges)
-        edges = unsorted_edges.sort().values
+    numbers = tree_edges(
+        x.cpu().numpy(),
+        window.cpu().numpy(),
+        radius,
+        box=box,
+        self_edges=self_edges,
+        most=most,
+    )
+    numbers.sort()
+    edges = torch.from_numpy(numbers).to(x.device)
     senders = edges & 0xFFFFFFFF
     receivers = edges >> 32
     return torch.stack([senders, receivers])
-
-
-def _check_search(
-    position: Tensor, radius: float, sample: Tensor | None, *, dimension: int
-) -> None:
-    """Refuse arguments of :func:`radius_graph` that do not fit."""
-    if position.ndim != 2 or position.shape[1] != dimension:
-        raise UsageError(
-            "positions have the wrong shape",
-            where="radius_graph",
-            expected=f"[particle, {dimension}]",
-            got=tuple(position.shape),
-        )
-    if not (math.isfinite(radius) and radius > 0.0):
-        raise UsageError(
-            "the radius is no length",
-            where="radius_graph",
-            expected="a positive number",
-            got=radius,
-        )
-    if sample is None:
-        return
-    is_valid = sample.shape == position.shape[:1]
-    if is_valid:
-        is_ascending = sample[1:] >= sample[:-1]
-        is_valid = bool(is_ascending.all())
-    if not is_valid:
-        raise UsageError(
-            "windows do not fit the particles",
-            where="radius_graph, sample",
-            expected=f"{len(position)} ascending numbers",
-            got=f"shape {tuple(sample.shape)}",
-        )
-
-
-def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) -> Any:  # noqa: ANN401
-    """Return receiver * 2^32 + sender of every edge, in no order.
-
-    ``xp`` is NumPy or torch; ``x`` and ``window`` are its arrays.
-    """
-    is_finite = xp.isfinite(x).all(1)
-    finite = xp.where(is_finite)[0]  # particles that have neighbours
-    x = x[finite]
-    window = window[finite]
-    key, stride = _cell_keys(xp, x, window, radius)
-
-    # Particles in the order of their cells.
-    order = xp.argsort(key, stable=True)
-    x = x[order]
-    key = key[order]
-    particle = finite[order]
-
-    # The candidates of each particle are two runs in that order: the rest of its own
-    # cell with the cell above, and three cells of the next column.
-    numbers = xp.arange(len(x), device=x.device)
-    own_start = numbers + 1
-    above_end = xp.searchsorted(key, key + 2)
-    beside_start = xp.searchsorted(key, key + (stride - 1))
-    beside_end = xp.searchsorted(key, key + (stride + 2))
-    own_count = above_end - own_start
-    beside_count = beside_end - beside_start
-    start = xp.concatenate([own_start, beside_start])
-    count = xp.concatenate([own_count, beside_count])
-    i, j = _expand_runs(xp, start, count, particles=len(x))
-
-    x_axis, y_axis = xp.stack([x[:, 0], x[:, 1]])
-    dx = x_axis[i] - x_axis[j]
-    dy = y_axis[i] - y_axis[j]
-    square_distance = dx * dx + dy * dy
-    is_near = square_distance <= radius * radius
-    near = xp.where(is_near)[0]
-    near_i = i[near]
-    near_j = j[near]
-    first = particle[near_i]
-    second = particle[near_j]
-
-    forward = (first << 32) | second
-    backward = (second << 32) | first
-    parts = [forward, backward]
-    if self_edges:
-        own_edges = (finite << 32) | finite
-        parts.append(own_edges)
-    return xp.concatenate(parts)
-
-
-def _cell_keys(xp: Any, x: Any, window: Any, radius: float) -> tuple[Any, Any]:  # noqa: ANN401
-    """Return the number of each particle's cell, and the cells of a column.
-
-    An empty row after each column and an empty column after each window keep their
-    neighbourhoods apart.
-    """
-    if not len(x):
-        return window, 0
-    width = radius * (1.0 + MARGIN)
-    cells_per_length = 1.0 / width
-    place = xp.floor(x * cells_per_length)
-    place = xp.clip(place, -FAR, FAR)
-    cell = xp.asarray(place, dtype=xp.int64)
-    cell = cell - xp.amin(cell, 0)
-    last_column, last_row = xp.amax(cell, 0)
-    columns = last_column + 2
-    stride = last_row + 2
-    column = window * columns + cell[:, 0]
-    row = cell[:, 1]
-    return column * stride + row, stride
-
-
-def _expand_runs(xp: Any, start: Any, count: Any, *, particles: int) -> tuple[Any, Any]:  # noqa: ANN401
-    """Return the pairs (i, j) of particles and the members of their runs.
-
-    Run k has ``count[k]`` members from ``start[k]`` on; it is of particle k, modulo the
-    number of particles.
-    """
-    numbers = xp.arange(len(count), device=start.device)
-    # The one repeat: each one makes the caller wait for a GPU.
-    run: Any
-    if xp is np:
-        run = np.repeat(numbers, count)
-    else:
-        run = torch.repeat_interleave(numbers, count)
-    i = run
-    if particles:
-        i = run % particles
-    first_pair = xp.cumsum(count, 0) - count
-    pair = xp.arange(len(run), device=start.device)
-    offset = start - first_pair
-    j = pair + offset[run]
-    return i, j
-
-
-def nearest_edges(
-    x: NDArray[np.float64],
-    window: NDArray[np.int64],
-    radius: float,
-    self_edges: bool,
-    most: int,
-) -> NDArray[np.int64]:
-    """Return receiver * 2^32 + sender of the edges to the nearest ``most`` neighbours.
-
-    ``x`` are positions [length], shape [particle, 2], ``window`` the number of the
-    window of each.
-    """
-    is_finite = np.isfinite(x).all(axis=1)
-    finite = np.flatnonzero(is_finite)
-    x = x[finite]
-    window = window[finite]
-    if not len(x):
-        return np.empty(0, np.int64)
-
-    # A third coordinate keeps windows farther apart than the radius.
-    height = 4.0 * radius * window
-    points = np.column_stack([x, height])
-    # A particle is among its own neighbours, unless more lie at its very place.
-    count = len(x)
-    most_ranks = min(most + 1, count)
-    ranks = np.arange(1, most_ranks + 1)
-    reach = radius * (1.0 + MARGIN)
-    tree = KDTree(points)
-    answer = tree.query(points, k=ranks, distance_upper_bound=reach)
-    neighbours = np.asarray(answer[1])
-
-    receiver = np.arange(count)[:, None]
-    sender = np.minimum(neighbours, count - 1)  # ``count`` stands for no neighbour
-    way = x[receiver] - x[sender]
-    dx, dy = np.moveaxis(way, -1, 0)
-    square_distance = dx * dx + dy * dy
-    is_near = square_distance <= radius * radius
-    is_neighbour = _is_neighbour(neighbours, count) & is_near
-    i, rank = _nearest_pairs(is_neighbour, most)
-
-    heard_receiver = finite[i]
-    heard_sender = finite[sender[i, rank]]
-    edges = (heard_receiver << 32) | heard_sender
-    parts = [edges]
-    if self_edges:
-        own_edges = (finite << 32) | finite
-        parts.append(own_edges)
-    return np.concatenate(parts)
 
 
 def _is_neighbour(neighbours: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
