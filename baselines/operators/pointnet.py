@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines.network import Linear
-
 from .operator import Losses, Operator
 
 
@@ -23,9 +21,9 @@ class PointNet(Operator):
 
     def __init__(self, inputs: int, latent: int, hidden: int) -> None:
         super().__init__(inputs, latent, hidden)
-        self.of_node = Linear(inputs, hidden)
-        self.of_edge = Linear(latent, hidden, bias=False)
-        output = Linear(hidden, latent)
+        self.of_node = nn.Linear(inputs, hidden)
+        self.of_edge = nn.Linear(latent, hidden, bias=False)
+        output = nn.Linear(hidden, latent)
         self.local = nn.Sequential(nn.ReLU(inplace=True), output)
 
     def forward(
