@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import importlib
 import sys
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from lagbench.baselines.predict import predict
+    from lagbench.baselines.train import train
+    from lagbench.board.submit import submit
     from lagbench.exchange.adoption import adopt
     from lagbench.figures.pictures import animate, plot
     from lagbench.make.generate import generate
@@ -38,9 +40,12 @@ __all__ = [
     "load_manifest",
     "open_split",
     "plot",
+    "predict",
     "score",
     "submission",
+    "submit",
     "template",
+    "train",
     "validate",
     "verify",
     "windows",
@@ -57,6 +62,9 @@ _MODULES = {
     "validate": "submission",
     "score": "scoring.score",
     "compare": "scoring.compare",
+    "train": "baselines.train",
+    "predict": "baselines.predict",
+    "submit": "board.submit",
     "plot": "figures.pictures",
     "animate": "figures.pictures",
     "adopt": "exchange.adoption",
@@ -91,16 +99,4 @@ def __getattr__(name: str) -> object:
 def __dir__() -> list[str]:
     """List the public names, also those that are not loaded yet, and no others."""
     special_names = [name for name in globals() if name.startswith("__")]
-    names = {*special_names, *__all__, *_PACKAGES}
-    if not _has_torch():
-        # inspect.getmembers reads each of these names, and this one would raise
-        names.discard("torch")
-    return sorted(names)
-
-
-def _has_torch() -> bool:
-    """Return whether PyTorch is installed, without importing it."""
-    try:
-        return find_spec("torch") is not None
-    except ValueError:  # sys.modules holds None, or a module without a specification
-        return sys.modules.get("torch") is not None
+    return sorted({*special_names, *__all__, *_PACKAGES})

@@ -54,6 +54,7 @@ from .layout import (
 )
 from .limits import (
     SCORED_SUBSETS,
+    SUBSETS,
     Value,
     check_frames,
     check_parameters,
@@ -83,6 +84,8 @@ def suggest_split(name: str, known_names: Collection[str]) -> str:
     >>> suggest_split("cavity,fluid", ["cavity", "fluid"])
     'name one split in each command, as in --split cavity'
     """
+    if name in SUBSETS:
+        return f"that is a subset: name the split first, then subset={name!r}"
     names = name.split(",")
     if len(names) > 1 and set(names) <= {*known_names}:
         return f"name one split in each command, as in --split {names[0]}"
@@ -625,6 +628,10 @@ class Registry:
         """
         parent = self.split(split)
         if name not in parent.sizes:
+            if name in SUBSETS:
+                raise UsageError(
+                    f"{name!r} is a subset, not a size; use subset={name!r}"
+                )
             names = " or ".join(parent.sizes)
             raise UsageError(
                 f"split {split!r} has no size {name!r}",

@@ -453,20 +453,16 @@ def test_without_pytorch_the_message_says_what_to_install() -> None:
 
 @pytest.mark.slow
 def test_without_pytorch_code_that_asks_for_it_goes_on() -> None:
-    """As any import of a missing module: the error is an ImportError, too. Looking at
-    all members of the package raises nothing.
-    """
+    """As any import of a missing module: the error is an ImportError, too."""
     program = (
-        "import sys; sys.modules['torch'] = None; import inspect; import lagbench\n"
+        "import sys; sys.modules['torch'] = None; import lagbench\n"
         "try: import lagbench.torch\n"
         "except ImportError as error: print(type(error).__name__)\n"
-        "names = [name for name, _ in inspect.getmembers(lagbench)]\n"
-        "print('torch' in names, 'score' in names)"
     )
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
-    assert run.stdout.split() == ["NotInstalledError", "False", "True"]
+    assert run.stdout.split() == ["NotInstalledError"]
 
 
 def test_completion_offers_public_names_only() -> None:
