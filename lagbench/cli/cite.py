@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import version
 
-import lagbench
 from lagbench.data.local import locate_split
 from lagbench.data.registry import Registry, Split, default_path, load
 from lagbench.errors import escape_line
@@ -111,15 +111,15 @@ def _is_ours(split: str, registry: Registry) -> bool:
 
 def _cite_program(*, bibtex: bool, as_json: bool) -> None:
     """Print how to cite lagbench itself."""
-    version = lagbench.__version__
+    program_version = version("lagbench")
     if bibtex:
-        fields = {"title": TITLE, "version": version, **RELEASE_FIELDS}
+        fields = {"title": TITLE, "version": program_version, **RELEASE_FIELDS}
         text = _format_bibtex("software", "lagbench", fields)
         print_result({"bibtex": text}, [text], as_json=as_json)
         return
-    citation = {"title": TITLE, "version": version, "year": RELEASE_YEAR}
+    citation = {"title": TITLE, "version": program_version, "year": RELEASE_YEAR}
     lines = [
-        f"The lagbench authors, {TITLE}, version {version}, {RELEASE_YEAR}.",
+        f"The lagbench authors, {TITLE}, version {program_version}, {RELEASE_YEAR}.",
         f"Splits: {', '.join(load().splits)}; `lagbench cite cavity` cites one.",
     ]
     print_result(citation, lines, as_json=as_json)
