@@ -26,9 +26,10 @@ from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
+from .front import NoSpeedup, Speedup
 from .published_scores import FORMAT, IDENTITY
 from .scenario import SUBMISSION, Preview
-from .skill import AgainstClassical, Skill
+from .skill import Skill
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,14 +59,11 @@ class ScoreCard:
     # as scored: it does not follow a replaced `scores`; None where no reference that
     # counts has a score
     skill: Skill | None
-    # None where the predictions state no cost, or no solver has a score
-    against_classical: AgainstClassical | None
+    speedup: Speedup | NoSpeedup  # over the classical side, or why there is none
     flags: tuple[Flag, ...]  # hints for the reader of a score
     warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
     preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
-    # why there is no `against_classical`; None where there is one
-    why_not_classical: str | None = None
 
     def __repr__(self) -> str:
         """Return method, ranking metric and skill; the values are too many."""
@@ -200,7 +198,11 @@ class ScoreCard:
         }
         content["ranking_metric"] = self.ranking
         content["skill"] = _skill_as_json(self.skill)
-        content["against_classical"] = _classical_as_json(self.against_classical)
+        content["speedup"] = None
+        if isinstance(self.speedup, Speedup):
+            content["speedup"] = _speedup_as_json(self.speedup)
+        else:
+            content["why_no_speedup"] = str(self.speedup)
 
         metrics = {}
         for score in self.submission.values():
@@ -321,14 +323,12 @@ def _skill_as_json(skill: Skill | None) -> dict[str, Any] | None:
     }
 
 
-def _classical_as_json(against: AgainstClassical | None) -> dict[str, Any] | None:
-    if against is None:
-        return None
+def _speedup_as_json(speedup: Speedup) -> dict[str, Any]:
     return {
-        "solver": against.reference,
-        "solver_costs_more": against.solver_costs_more,
-        "value": digits(against.value),
-        "interval": _interval_as_json(against.interval),
+        "value": digits(speedup.value),
+        "interval": _interval_as_json(speedup.interval),
+        "at_least": speedup.at_least,
+        "classical_seconds": digits(speedup.classical_seconds),
     }
 
 

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lagbench.data.registry import Size
 from lagbench.metrics.aggregate import (
     FEWEST_FOR_INTERVAL,
     LEVEL,
@@ -177,7 +178,10 @@ def _hull_cost(model: Floats, errors: Floats, costs: Floats) -> Floats:
 class NoSpeedup(enum.StrEnum):
     """Why a method has no speedup."""
 
-    NO_COST = "the method states no cost"
+    NO_COST = (
+        "seconds_per_frame or solver_seconds_per_frame is not stated; `lagbench "
+        "predict` states both, `lagbench bench` times our solver"
+    )
     NO_CLASSICAL = "no classical or calibrated solver was scored and timed here"
     NOT_BETTER_THAN_NAIVE = "it is no better than the best naive predictor"
     TOO_FEW = "there is no scenario in which all rows have a value"
@@ -324,6 +328,14 @@ def pays_after_holm(speedups: Mapping[str, Speedup]) -> list[str]:
         if speedup.pays and p < SIGNIFICANCE:
             pays.append(name)
     return pays
+
+
+def generation_hours(size: Size, solver_seconds: float) -> float:
+    """Return the processor time to generate train [h], that of a frame given [s]."""
+    frames = 0
+    for scenario in size.subsets["train"]:
+        frames += size.frame_count(scenario)
+    return solver_seconds * frames / 3600.0
 
 
 def breakeven(

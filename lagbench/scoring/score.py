@@ -40,7 +40,7 @@ from lagbench.metrics.table import (
 from lagbench.references import extrapolation
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import ReferenceScores, shipped
-from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
+from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import Predictions, open_predictions
@@ -70,10 +70,7 @@ from .scenario import (
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME
 from .score_file_writer import write_statistics
-from .skill import (
-    compare_with_solvers,
-    compute_skill,
-)
+from .skill import compute_skill, speedup_beside
 from .task import ScoredTask, load_scored_task
 
 WORTH_WORKERS = 1_000_000
@@ -310,13 +307,7 @@ def _make_card(
         if row in NAIVE and ranking in row_scores:
             counting[row] = row_scores[ranking]
 
-    classical = {}
-    for name in CLASSICAL.intersection(shipped_references):
-        classical[name] = shipped_references[name]
-
-    against_classical, why_not = compare_with_solvers(
-        header, task.size, submission, classical
-    )
+    speedup = speedup_beside(header, task.size, submission, shipped_references)
     few_nodes = _warn_of_few_nodes(task, measurement.tallies[SUBMISSION])
     return ScoreCard(
         header=header,
@@ -326,8 +317,7 @@ def _make_card(
         tallies=measurement.tallies,
         scores=scores,
         skill=compute_skill([submission], counting),
-        against_classical=against_classical,
-        why_not_classical=why_not,
+        speedup=speedup,
         flags=_judge(task, measurement.outcomes, scores),
         warnings=(*warnings, *measurement.failures, *few_nodes),
         preview=next(

@@ -36,9 +36,16 @@ from lagbench.metrics.aggregate import (
 from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction
 from lagbench.references.shipped import ReferenceScores, solver_seconds
+from lagbench.references.table import REFERENCES
 from lagbench.submission.format import Header
 
-from .front import seconds_where_measured
+from .front import (
+    NoSpeedup,
+    Speedup,
+    compute_speedup,
+    front_row,
+    seconds_where_measured,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,54 +190,46 @@ def compute_against_classical(
     )
 
 
-def compare_with_solvers(
+def speedup_beside(
     header: Header,
     size: Size,
     submission: Score,
-    classical: Mapping[str, ReferenceScores],
-) -> tuple[AgainstClassical | None, str | None]:
-    """Return the submission's score over that of the best classical solver that costs
-    no more per frame, or of the cheapest one where all cost more.
-
-    Where there is no such ratio, the reason comes instead.
+    references: Mapping[str, ReferenceScores],
+) -> Speedup | NoSpeedup:
+    """Return the speedup of predictions over the classical side, or why they have none.
 
     Args:
         header: what the predictions say about themselves, its costs among it.
         size: the data set.
         submission: score of the submission in the ranking metric.
-        classical: shipped scores and costs of the classical solvers.
+        references: shipped scores and costs of the reference predictors.
     """
-    solvers = {}
-    costs = {}
-    for name, reference in classical.items():
-        if submission.metric.name in reference.scores:
-            solvers[name] = reference.scores[submission.metric.name]
-            costs[name] = reference.seconds_per_frame
-    seconds_here = solver_seconds(size)
-    if not solvers or seconds_here is None:
-        return None, "no classical solver was scored and timed on this data set"
-
+    metric = submission.metric.name
+    scenarios = submission.scenarios
+    rows = []
+    for name, reference in references.items():
+        if name in REFERENCES and metric in reference.scores:
+            row = front_row(
+                name=name,
+                kind=REFERENCES[name].kind,
+                seconds=reference.seconds_per_frame,
+                seeds=[reference.scores[metric]],
+                scenarios=scenarios,
+            )
+            rows.append(row)
     seconds = seconds_where_measured(
         seconds_per_frame=header.seconds_per_frame,
         solver_seconds=header.solver_seconds_per_frame,
-        solver_seconds_here=seconds_here,
+        solver_seconds_here=solver_seconds(size),
     )
-    if seconds is None:
-        missing = []
-        for label in ("seconds_per_frame", "solver_seconds_per_frame"):
-            if getattr(header, label) is None:
-                missing.append(label)
-        return None, (
-            f"the predictions do not state {' and '.join(missing)}; `lagbench "
-            "predict` without --no-bench states both; for another model `lagbench "
-            "bench` times our solver on its machine"
-        )
-    ratio = compute_against_classical(
-        [submission], solvers, seconds=costs, seconds_per_frame=seconds
+    model = front_row(
+        name=header.method,
+        kind="learned",
+        seconds=seconds,
+        seeds=[submission],
+        scenarios=scenarios,
     )
-    if ratio is not None:
-        return ratio, None
-    return None, "no classical solver has a score above 0 in these scenarios"
+    return compute_speedup(model, rows)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ from lagbench.submission.issues import quote
 from .card import BRIEF_ROWS, ScoreCard
 from .compare import ComparisonResult, MetricComparison
 from .flags import Flag
+from .front import Speedup
 from .scenario import SUBMISSION
 
 SHOWN_AT_FRAMES = (
@@ -107,7 +108,8 @@ def brief_lines(card: ScoreCard) -> Iterator[str]:
     for row in _best_reference(card):
         yield f"against {row}: {_against(card, row)}"
     yield from _cost_lines(card)
-    yield from _classical_lines(card)
+    if not isinstance(card.speedup, Speedup):
+        yield f"speedup: none, because {card.speedup}"
     for flag in card.flags:
         if flag.raised:
             yield _flag_line(flag)
@@ -127,13 +129,8 @@ def _over_horizon(
     for row in references:
         zeros.append("0" if row == best else "")
     rows = [("skill ↑", skill_cell, *zeros)]
-    if card.against_classical is not None:
-        against = card.against_classical
-        cell = _with_interval(against.value, against.interval)
-        solver = against.reference
-        if against.solver_costs_more:
-            solver += ", which costs more"
-        rows.append((f"against {solver} ↓", cell, *[""] * len(references)))
+    if isinstance(card.speedup, Speedup):
+        rows.append(("speedup ↑", str(card.speedup), *[""] * len(references)))
 
     for name in names:
         score = card.submission[name]
@@ -211,7 +208,8 @@ def flag_lines(card: ScoreCard, *, every: bool = False) -> Iterator[str]:
         if row != SUBMISSION:
             yield f"against {row}: {_against(card, row)}"
     yield from _cost_lines(card)
-    yield from _classical_lines(card)
+    if not isinstance(card.speedup, Speedup):
+        yield f"speedup: none, because {card.speedup}"
     for flag in card.flags:
         yield _flag_line(flag)
     yield from _warning_lines(card)
@@ -241,12 +239,6 @@ def _cost_lines(card: ScoreCard) -> Iterator[str]:
         f"cost: {_number(header.seconds_per_frame)} s per frame on {machine}; the "
         f"predictions state it, and nothing was timed here"
     )
-
-
-def _classical_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield why no classical solver stands beside the score, if so."""
-    if card.against_classical is None and card.why_not_classical is not None:
-        yield f"against_classical: none, because {card.why_not_classical}"
 
 
 def _flag_line(flag: Flag) -> str:

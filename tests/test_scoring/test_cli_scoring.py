@@ -53,7 +53,7 @@ def test_a_template_validates_and_scores(run: Run, predictions: Path) -> None:
         "vorticity_rmse",
         "vorticity_pearson 40",
         "1/frame",
-        "against_classical: none",
+        "speedup: none",
         "flag copy_suspect",
         "scores.nc",
     )
