@@ -42,6 +42,7 @@ from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
 from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
 from lagbench.scoring.boards import advise_board_check
+from lagbench.scoring.front import seconds_where_measured
 from lagbench.scoring.scenario import Preview, spaced
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
@@ -53,7 +54,6 @@ from lagbench.scoring.skill import (
     Skill,
     compute_against_classical,
     compute_skill,
-    seconds_where_measured,
 )
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import available_cores

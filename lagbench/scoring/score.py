@@ -19,7 +19,7 @@ from lagbench.data.local import (
     locate_split,
     resolve_root,
 )
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
     UnreadableFileError,
     UsageError,
@@ -39,7 +39,7 @@ from lagbench.metrics.table import (
 )
 from lagbench.references import extrapolation
 from lagbench.references.predictor import given_in
-from lagbench.references.shipped import ReferenceScores, shipped
+from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
 from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
@@ -51,6 +51,13 @@ from lagbench.work.run import Meter, Progress, run_all
 
 from .card import JSON_NAME, ScoreCard, format_scores
 from .flags import Flag, Trace, judge_copying, judge_physics, judge_predictability
+from .front import (
+    NoSpeedup,
+    Speedup,
+    compute_speedup,
+    front_row,
+    seconds_where_measured,
+)
 from .package_metrics import (
     PackageMetricError,
     describe_failure,
@@ -70,7 +77,7 @@ from .scenario import (
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME
 from .score_file_writer import write_statistics
-from .skill import compute_skill, speedup_beside
+from .skill import compute_skill
 from .task import ScoredTask, load_scored_task
 
 WORTH_WORKERS = 1_000_000
@@ -326,6 +333,48 @@ def _make_card(
             if outcome.preview is not None
         ),
     )
+
+
+def speedup_beside(
+    header: Header,
+    size: Size,
+    submission: Score,
+    references: Mapping[str, ReferenceScores],
+) -> Speedup | NoSpeedup:
+    """Return the speedup of predictions over the classical side, or why they have none.
+
+    Args:
+        header: what the predictions say about themselves, its costs among it.
+        size: the data set.
+        submission: score of the submission in the ranking metric.
+        references: shipped scores and costs of the reference predictors.
+    """
+    metric = submission.metric.name
+    scenarios = submission.scenarios
+    rows = []
+    for name, reference in references.items():
+        if name in REFERENCES and metric in reference.scores:
+            row = front_row(
+                name=name,
+                kind=REFERENCES[name].kind,
+                seconds=reference.seconds_per_frame,
+                seeds=[reference.scores[metric]],
+                scenarios=scenarios,
+            )
+            rows.append(row)
+    seconds = seconds_where_measured(
+        seconds_per_frame=header.seconds_per_frame,
+        solver_seconds=header.solver_seconds_per_frame,
+        solver_seconds_here=solver_seconds(size),
+    )
+    model = front_row(
+        name=header.method,
+        kind="learned",
+        seconds=seconds,
+        seeds=[submission],
+        scenarios=scenarios,
+    )
+    return compute_speedup(model, rows)
 
 
 def _aggregate(

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.data.registry import Size
 from lagbench.errors import ChecksFailedError, format_count
 from lagbench.metrics.aggregate import (
     FEWEST_FOR_INTERVAL,
@@ -35,17 +34,6 @@ from lagbench.metrics.aggregate import (
 )
 from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction
-from lagbench.references.shipped import ReferenceScores, solver_seconds
-from lagbench.references.table import REFERENCES
-from lagbench.submission.format import Header
-
-from .front import (
-    NoSpeedup,
-    Speedup,
-    compute_speedup,
-    front_row,
-    seconds_where_measured,
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,48 +176,6 @@ def compute_against_classical(
         std=ratio.std,
         solver_costs_more=costs_more,
     )
-
-
-def speedup_beside(
-    header: Header,
-    size: Size,
-    submission: Score,
-    references: Mapping[str, ReferenceScores],
-) -> Speedup | NoSpeedup:
-    """Return the speedup of predictions over the classical side, or why they have none.
-
-    Args:
-        header: what the predictions say about themselves, its costs among it.
-        size: the data set.
-        submission: score of the submission in the ranking metric.
-        references: shipped scores and costs of the reference predictors.
-    """
-    metric = submission.metric.name
-    scenarios = submission.scenarios
-    rows = []
-    for name, reference in references.items():
-        if name in REFERENCES and metric in reference.scores:
-            row = front_row(
-                name=name,
-                kind=REFERENCES[name].kind,
-                seconds=reference.seconds_per_frame,
-                seeds=[reference.scores[metric]],
-                scenarios=scenarios,
-            )
-            rows.append(row)
-    seconds = seconds_where_measured(
-        seconds_per_frame=header.seconds_per_frame,
-        solver_seconds=header.solver_seconds_per_frame,
-        solver_seconds_here=solver_seconds(size),
-    )
-    model = front_row(
-        name=header.method,
-        kind="learned",
-        seconds=seconds,
-        seeds=[submission],
-        scenarios=scenarios,
-    )
-    return compute_speedup(model, rows)
 
 
 @dataclass(frozen=True, kw_only=True)

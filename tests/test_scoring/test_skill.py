@@ -40,12 +40,12 @@ from lagbench.scoring.references import (
     sizes_with_test_files,
 )
 from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.score import speedup_beside
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import (
     best_reference,
     compute_skill,
     skill_gap,
-    speedup_beside,
 )
 from lagbench.scoring.tables import card_tables
 from lagbench.submission import Header
