@@ -546,7 +546,7 @@ def _moving_frames(judgement: Judgement, extent: float) -> Floats:
     return np.asarray(moments[has_moved] / extent**powers)
 
 
-def find_shift(predicted: Floats, truth: Floats) -> int:
+def find_shift(predicted: Floats, truth: Floats, box: Box) -> int:
     """Return by how many frames a prediction is late (-1) or early (1), else 0.
 
     It is shifted if it fits the true frames before, or after, far better than its own.
@@ -556,9 +556,12 @@ def find_shift(predicted: Floats, truth: Floats) -> int:
             axis].
         truth: true positions of the same frames, of the one before and of the one
             after them.
+        box: the box of the particles.
     """
     count = len(predicted)
-    errors = [_rms(predicted - truth[start : start + count]) for start in range(3)]
+    errors = []
+    for start in range(3):
+        errors.append(_rms(box.displacement(truth[start : start + count], predicted)))
     if errors[1] == 0.0:
         return 0
     best = int(np.argmin(errors))

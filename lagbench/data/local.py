@@ -383,8 +383,7 @@ def _locate_folder(
             expected=f"the name of a split, or a folder that holds {DESCRIPTION}, "
             f"named like its split",
             got=folder,
-            fix="lagbench list names the splits; lagbench import and lagbench adopt "
-            "make local ones",
+            fix="lagbench list names the splits; lagbench import makes local ones",
         )
     rooted_registry = load_rooted_registry(parent, registry)
     if name not in rooted_registry.local_names():
@@ -531,8 +530,7 @@ def suggest_repair(size: Size, *options: str, root: Path | None = None) -> str:
     'lagbench generate --split cavity --size tiny --subset test'
     """
     if not size.simulated:
-        commands = "lagbench adopt, or lagbench import"
-        return f"remove the folder and make the local split again: {commands}"
+        return "remove the folder and make the local split again: lagbench import"
     parts = [f"lagbench generate --split {size.split} --size {size.name}", *options]
     if root is not None:
         url = url_of(root) or ""

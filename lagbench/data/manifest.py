@@ -298,7 +298,7 @@ MANIFEST_LIMIT = 64 << 20
 
 _MANIFEST_HINT = (
     "remove it; lagbench generate checks the files and writes it anew; "
-    "a local split is made again by lagbench adopt or import"
+    "a local split is made again by lagbench import"
 )
 
 

@@ -596,5 +596,5 @@ def require_known_material(material: NDArray[Any], *, where: str, fix: str) -> N
 
 def _repair_hint(path: Path) -> str:
     command = generation_command(path) or "lagbench generate"
-    advice = "a local split is made again by lagbench adopt or import"
+    advice = "a local split is made again by lagbench import"
     return f"{command} writes it anew; {advice}"

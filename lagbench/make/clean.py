@@ -100,7 +100,7 @@ def _local_split_error(size: Size, home: Path) -> UsageError:
         "lagbench cannot make these data again",
         where=str(size.folder(home)),
         expected="a data set that lagbench generates, or --force",
-        got="a local split, made by adopt or import",
+        got="a local split, made by import",
         fix=f"lagbench clean {names} --force",
     )
 

@@ -167,8 +167,7 @@ def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
             where=f"{size.split} {size.name}",
             expected="a split that a generator makes",
             got="a split that was adopted or imported",
-            fix="lagbench import or lagbench adopt makes it again from the data that "
-            "it came from",
+            fix="lagbench import makes it again from the data that it came from",
         )
     solver_constants(size)  # refuses parameters that the solver cannot use
 

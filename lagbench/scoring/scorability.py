@@ -64,7 +64,7 @@ def _suggest_grid(task: ScoredTask) -> str:
     if cells is None and longest_side < SMALL_SIDE:
         return (
             f"lengths in another unit: the longest side of the box is "
-            f"{longest_side:.2g}; adopt or import the data anew with --rescale"
+            f"{longest_side:.2g}; import the data anew, which scales them"
         )
     if cells is None:
         return "more particles: they cover enough nodes of no grid"
@@ -75,10 +75,9 @@ def _suggest_grid(task: ScoredTask) -> str:
     # no path of this machine: scores.json repeats it
     description = Path(task.size.split) / DESCRIPTION
     is_local = (task.truth.root / description).is_file()
-    edit = ""
-    if is_local:
-        edit = f"cells: {cells} under score_grid in {description.as_posix()}, or "
-    return f"a {word} grid: {edit}--cells {cells} of lagbench adopt and import"
+    if not is_local:
+        return f"a {word} grid: {cells} cells"
+    return f"a {word} grid: cells: {cells} under score_grid in {description.as_posix()}"
 
 
 def _all_clouds(task: ScoredTask) -> Iterator[Cloud]:
@@ -145,7 +144,7 @@ def _check_subset(task: ScoredTask) -> Iterator[str]:
     if not moves:
         yield (
             f"nothing moves in {subset}: no reference has an error to be better than; "
-            f"other trajectories for {subset}: lagbench adopt with folders train, "
+            f"other trajectories for {subset}: lagbench import with folders train, "
             f"valid and test"
         )
     elif sparse and ranking_metric(task.size) == OF_NODES:

@@ -15,7 +15,14 @@ from typing import Any
 
 import h5py
 
-from lagbench.data.hdf5 import MAX_LINKS, hdf5_errors, list_members, open_variable
+from lagbench.data.box import AXES
+from lagbench.data.hdf5 import (
+    MAX_LINKS,
+    hdf5_errors,
+    is_text,
+    list_members,
+    open_variable,
+)
 from lagbench.data.structure import (
     MAX_ATTRIBUTE,
     ArrayInfo,
@@ -171,6 +178,7 @@ class FileInfo:
     # scale_factor and add_offset of ``position``, where it has them
     packing: Mapping[str, object]
     integers: Mapping[str, tuple[int, ...]]  # coordinates whose values could be read
+    components: tuple[str, ...]  # names of the components of a position, if any
     length: int  # length of the file [bytes]
 
 
@@ -284,18 +292,28 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
     arrays = {}
     integers = {}
     packing = {}
-    for name in ("position", *INTEGERS):
+    for name in ("position", "particle", *INTEGERS):
         if links.get(name) != "variable":
             continue
         with hdf5_errors(path, name):
             dataset = open_variable(file, name)
             array = describe_array(dataset)
+            if name == "particle":  # without values netCDF keeps a float in its place
+                if is_coordinate_readable(array, length=length):
+                    integers[name] = tuple(int(value) for value in dataset[...])
+                continue
             # A scalar has no dimensions to check.
             arrays[name] = array if array.shape else replace(array, shape=None)
             if name == "position":
                 packing = read_packing(dataset)
             elif is_coordinate_readable(array, length=length):
                 integers[name] = tuple(int(value) for value in dataset[...])
+    components: tuple[str, ...] = ()
+    if links.get("space") == "variable":
+        with hdf5_errors(path, "space"):
+            space = open_variable(file, "space")
+            if is_text(space) and space.shape in [(count,) for count in SPACES]:
+                components = tuple(str(name) for name in space.asstr()[...])
     return FileInfo(
         links=links,
         link_count=link_count,
@@ -303,6 +321,7 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
         arrays=arrays,
         packing=packing,
         integers=integers,
+        components=components,
         length=length,
     )
 
@@ -552,7 +571,22 @@ def check_dims(
             fix=fix,
         )
         return False
-    return _check_particle_counts(info, array.shape, issues)
+    particles = info.integers.get("particle", ())
+    if info.components not in ((), AXES[:dimension]):
+        fault = f"components are named {', '.join(map(quote, info.components))}"
+    elif list(particles) != list(range(len(particles))):
+        fault = "the coordinate particle is not 0, 1, 2 and so on"
+    else:
+        return _check_particle_counts(info, array.shape, issues)
+    issues.error(
+        "dims",
+        "components or particles stand in another order",
+        where=where,
+        expected=f"{', '.join(AXES[:dimension])}, and particles 0, 1, 2 and so on",
+        got=fault,
+        fix="store components x, y, z and particles in the order of the given frames",
+    )
+    return False
 
 
 def _check_particle_counts(

@@ -31,6 +31,7 @@ CHECKS = (
     "diverged_at",
     "start",
     "discontinuous_start",
+    "shifted",
     "in_domain",
     "max_displacement",
 )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
+from lagbench.data.judgement import find_shift
 
 from .issues import IssueCollector
 from .predictions import Predictions
@@ -22,6 +23,9 @@ from .truth import Truth, squared_steps
 
 JUMP = 10.0
 """A step is suspect beyond this many of the truth's largest per-frame displacement."""
+
+SHIFT_FRAMES = 5
+"""First predicted frames that are compared with the true ones before and after."""
 
 Positions = NDArray[np.float32]
 
@@ -114,6 +118,37 @@ def check_start(
                 "it is scored, and flagged on the board",
             )
     issues.complete("start", "discontinuous_start")
+
+
+def check_shift(predictions: Predictions, truth: Truth, issues: IssueCollector) -> None:
+    """Flag predictions that are one frame late, or early, in every scenario."""
+    first = predictions.header.frames[0]
+    count = min(SHIFT_FRAMES, truth.size.task.horizon - 1)
+    scored = set(truth.size.scored_scenarios).intersection(predictions.header.scenarios)
+    shifts = set()
+    for scenario in sorted(scored) if count > 1 else ():
+        predicted = predictions.frames(scenario, first, count).astype(np.float64)
+        true_frames = truth.frames(scenario, first - 1, first + count + 1)
+        shift = 0
+        if np.isfinite(predicted).all():
+            shift = find_shift(predicted, true_frames, truth.size.box)
+        shifts.add(shift)
+        if shifts != {shift} or shift == 0:
+            shifts = {0}
+            break
+    if shifts in ({-1}, {1}):
+        late = shifts == {-1}
+        issues.warning(
+            "shifted",
+            f"predictions are one frame {'late' if late else 'early'}: in every "
+            f"scenario they fit the true frames {'before' if late else 'after'} far "
+            "better than their own",
+            where=f"frames {first} to {first + count - 1}",
+            expected="the frame after the last given one first",
+            got="a rollout that begins with another one",
+            fix="begin with the frame after the last given one",
+        )
+    issues.complete("shifted")
 
 
 def is_start_permuted(start: StartFrames) -> bool:

@@ -114,7 +114,7 @@ class Truth:
 
         Positions [length], shape [frame, particle, space].
         """
-        return self._frames(scenario, 0, self.size.task.input_frames)
+        return self.frames(scenario, 0, self.size.task.input_frames)
 
     def frames_around_start(self, scenario: int) -> NDArray[np.float32]:
         """Return the last given frame and the first two to predict, or the only one.
@@ -124,9 +124,10 @@ class Truth:
         task = self.size.task
         first_to_predict = task.input_frames
         stop = first_to_predict + min(2, task.horizon)
-        return self._frames(scenario, first_to_predict - 1, stop)
+        return self.frames(scenario, first_to_predict - 1, stop)
 
-    def _frames(self, scenario: int, start: int, stop: int) -> NDArray[np.float32]:
+    def frames(self, scenario: int, start: int, stop: int) -> NDArray[np.float32]:
+        """Return some positions [length], shape [frame, particle, space]."""
         with self.open(scenario) as file:
             frames: NDArray[np.float32] = file.read("position", slice(start, stop))
         particles = self.size.particle_count(scenario)

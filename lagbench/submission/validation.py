@@ -66,7 +66,7 @@ from .issues import (
 )
 from .other_files import refuse_other_files
 from .predictions import attach
-from .start import check_start, read_starts
+from .start import check_shift, check_start, read_starts
 from .task_checks import (
     check_dataset,
     check_frames,
@@ -95,7 +95,7 @@ BYTES_PER_SECOND = 20e6
 BLOCK_BYTES = 512
 """Unit in which a system counts what a file occupies [bytes]."""
 
-TRUTH_CHECKS = ("start", "discontinuous_start", "max_displacement")
+TRUTH_CHECKS = ("start", "discontinuous_start", "shifted", "max_displacement")
 VALUE_CHECKS = ("finite", "in_domain", *TRUTH_CHECKS)
 TASK_CHECKS = ("dataset", "scenarios", "frames", "particles")
 
@@ -438,6 +438,7 @@ def _check_values(
             starts = read_starts(predictions, truth)
             first_frame = predictions.header.frames[0]
             check_start(starts, first_frame=first_frame, truth=truth, issues=issues)
+            check_shift(predictions, truth, issues)
             check_jumps(scans, starts, truth=truth, issues=issues)
         except DataError as error:
             issues.add_exception("dataset", error)

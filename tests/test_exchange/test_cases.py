@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 from trajectories import vortex
 
+from lagbench.data.box import UNIT_SQUARE
 from lagbench.data.judgement import find_shift
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt
@@ -344,7 +345,7 @@ def test_a_prediction_that_is_late_or_early_is_seen(shift: int) -> None:
     truth = vortex(0, frames=12).astype(np.float64)
     frames = np.arange(6, 11) + shift
     noise = np.random.default_rng(0).normal(0, 1e-4, (5, 144, 2))
-    assert find_shift(truth[frames] + noise, truth[5:12]) == shift
+    assert find_shift(truth[frames] + noise, truth[5:12], UNIT_SQUARE) == shift
 
 
 def test_a_radius_of_many_neighbours_is_noted(tmp_path: Path) -> None:

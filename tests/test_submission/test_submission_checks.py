@@ -15,6 +15,7 @@ from unittest import mock
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from bad_submissions import FAULTS
 from fault_registry import positions, rows, store
 from numpy.typing import ArrayLike
@@ -200,7 +201,12 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
     elsewhere = replace(bench, root=tmp_path)
     result = elsewhere.validate(bench.valid)
     assert result.exit_code == 0
-    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
+    assert set(result.skipped) == {
+        "start",
+        "discontinuous_start",
+        "shifted",
+        "max_displacement",
+    }
     assert "lagbench generate --split cavity" in result.skipped["start"]
     required = elsewhere.validate(bench.valid, require_truth=True)
     assert required.exit_code == 4
@@ -364,7 +370,12 @@ def test_a_damaged_data_set_is_not_blamed_on_the_submission(
     assert str(path) in result.errors[0].where
     command = "lagbench generate --split cavity --size tiny --subset test --root"
     assert f"{command} {shlex.quote(str(own.root))}" in result.errors[0].fix
-    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
+    assert set(result.skipped) == {
+        "start",
+        "discontinuous_start",
+        "shifted",
+        "max_displacement",
+    }
 
 
 def test_a_change_after_the_check_is_refused(own: Bench, hashed: mock.Mock) -> None:
@@ -455,3 +466,19 @@ def test_the_scorer_refuses_a_changed_truth(
             write=False,
         )
     assert caught.value.exit_code == 4
+
+
+@pytest.mark.parametrize("name", ["space", "particle"])
+def test_named_components_and_particles_in_another_order_are_refused(
+    bench: Bench, name: str
+) -> None:
+    """As the coordinates say which a program wrote that knows names."""
+    with xr.open_dataset(bench.copy("named.nc"), decode_times=False) as file:
+        named = file.load()
+    labels = {"space": ["x", "y"], "particle": np.arange(PARTICLES)}
+    named = named.assign_coords({name: labels[name]})
+    path = bench.copy("named.nc")
+    named.to_netcdf(path, encoding={"position": {"zlib": True}})
+    assert not bench.validate(path).errors
+    named.isel({name: slice(None, None, -1)}).to_netcdf(path)
+    assert {issue.check for issue in bench.validate(path).errors} == {"dims"}
