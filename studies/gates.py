@@ -42,8 +42,7 @@ from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
 from lagbench.baselines.simulator import GraphNetwork
-from lagbench.board.entry import Status
-from lagbench.board.entry_file import read_entry
+from lagbench.board.entry import Status, read_entry
 from lagbench.board.folder import GATES, Folder
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Size
@@ -415,7 +414,7 @@ def board_weights(folder: Folder, splits: Sequence[str], size: str) -> list[Path
             continue
         for prediction in entry.predictions:
             weights = prediction.weights
-            if weights is None or weights.place_of(entry.place)[1] != size:
+            if weights is None or Path(weights.path).parts[2] != size:
                 continue
             path = folder.path / weights.path
             if is_graph_network(path):

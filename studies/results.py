@@ -18,17 +18,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lagbench.board.overview import FINDING
 from lagbench.figures.tables import markdown
 
 Json = Any
-MODEL_KINDS = ("calibrated", "learned", "hybrid")
+MODEL_KINDS = ("learned", "hybrid")
+CLASSICAL_KINDS = ("classical", "calibrated")
 
 PAGE = """\
 # Results
 
-On this page you find the best model of each data set beside the best naive predictor
-and the best classical solver. The table
+On this page you find the best network of each data set beside the best naive predictor
+and the best row of the classical side (classical solvers, and solvers with fitted
+constants). The table
 [results.csv](results.csv) has score, skill, cost and training of every method.
 
 `python -m studies.results` writes both files from the [leaderboard](submitting.md).
@@ -46,12 +47,12 @@ contain the 95 % interval. The time is the processor time of one frame on one co
 """
 
 
-def read_tabs(board: Path) -> Json:
-    """Return the rows of every data set of a leaderboard."""
+def read_board(board: Path) -> Json:
+    """Return the conclusion of a leaderboard, and the rows of every data set."""
     command = [sys.executable, "-m", "lagbench", "leaderboard", "show", "--json"]
     command += ["--board", str(board)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
-    return json.loads(done.stdout)["tabs"]
+    return json.loads(done.stdout)
 
 
 def _mean(statistic: Json) -> object:
@@ -61,7 +62,7 @@ def _mean(statistic: Json) -> object:
 def ranking_row(tab: Json, row: Json) -> dict[str, object]:
     """Return score, skill, cost and training of a method."""
     score = row["metrics"][tab["ranking_metric"]]
-    cost = row.get("cost") or {}
+    speedup = row.get("speedup") or {}
     budget = row.get("budget") or {}
     return {
         "split": tab["split"],
@@ -74,9 +75,9 @@ def ranking_row(tab: Json, row: Json) -> dict[str, object]:
         "low": score["low"],
         "high": score["high"],
         "skill": _mean(row.get("skill")),
-        "seconds_per_frame": cost.get("seconds_per_frame"),
-        "speedup": _mean(row.get("speedup")),
-        "breakeven": _mean(row.get("breakeven")),
+        "seconds_per_frame": row.get("seconds_per_frame"),
+        "speedup": speedup.get("value"),
+        "breakeven": row.get("breakeven"),
         "seeds": row.get("seeds"),
         "parameters": row.get("parameters"),
         "training_cpu_hours": budget.get("cpu_hours"),
@@ -136,20 +137,21 @@ def summary_table(rows: Sequence[Json]) -> str:
                 place,
                 methods[0]["metric"],
                 _cell(_best(methods, ("naive",))),
-                _cell(_best(methods, ("classical",))),
+                _cell(_best(methods, CLASSICAL_KINDS)),
                 _cell(model),
                 model["kind"] if model else "-",
                 speedup,
             )
         )
-    heads = ("data set", "metric", "best naive", "best classical", "best model")
+    heads = ("data set", "metric", "best naive", "best classical side", "best network")
     return markdown((*heads, "kind", "speedup"), lines)
 
 
-def render(tabs: Json, page: Path) -> dict[Path, str]:
+def render(board: Json, page: Path) -> dict[Path, str]:
     """Return the texts of the page and of its table, by file."""
-    rows = ranking_rows(tabs)
-    text = PAGE.format(finding=" ".join(FINDING), table=summary_table(rows))
+    rows = ranking_rows(board["tabs"])
+    finding = " ".join(board["conclusion"])
+    text = PAGE.format(finding=finding, table=summary_table(rows))
     return {
         page: text,
         page.with_suffix(".csv"): to_csv(rows),
@@ -165,7 +167,7 @@ def main() -> int:
     parser.add_argument("--board", type=Path, default=Path("leaderboard"))
     parser.add_argument("--check", action="store_true", help="write nothing")
     options = parser.parse_args()
-    files = render(read_tabs(options.board), options.output)
+    files = render(read_board(options.board), options.output)
     if not options.check:
         for path, text in files.items():
             path.write_text(text)

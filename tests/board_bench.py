@@ -11,19 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 import yaml
 from filelock import FileLock
 from numpy.typing import NDArray
 from registry_text import described_splits
 
-from lagbench.board.entry import Meta
-from lagbench.board.entry_file import read_entry
-from lagbench.board.folder import LOCK
-from lagbench.board.publish import SubmitResult
-from lagbench.board.ranking import combine, summarise
-from lagbench.board.submit import submit
+from lagbench.board.entry import Meta, read_entry
+from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
 from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Registry, Size, load
@@ -32,7 +27,6 @@ from lagbench.data.yamlfile import format_yaml
 from lagbench.figures.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import write
 
@@ -352,7 +346,6 @@ class BoardBench:
         self,
         *paths: Path,
         replace: bool = False,
-        add: bool = False,
         **keys: Any,
     ) -> SubmitResult:
         """Submit predictions."""
@@ -366,7 +359,6 @@ class BoardBench:
             paths,
             meta,
             replace=replace,
-            add=add,
             new_board=True,
             **self.where,
         )
@@ -393,26 +385,6 @@ class BoardBench:
         text = yaml.dump(content, Dumper=yaml.CSafeDumper, sort_keys=False)
         path.write_text(text)
 
-    def forge(self, method: str) -> None:
-        """Make hashes and aggregates of an entry follow from its score files.
-
-        A forger who knows the format does so.
-        """
-        self.rehash(method)
-        entry = read_entry(self.entry(method))
-        tallies = []
-        for path in entry.score_paths:
-            score_file = read_score_file(self.folder / path)
-            tallies.append(score_file.scores.tallies)
-        metrics = {}
-        for name, summary in summarise(combine(tallies)).items():
-            metrics[name] = summary.model_dump()
-
-        def change(content: dict[str, Any]) -> None:
-            content["score"]["metrics"] = metrics
-
-        self.edit(method, change)
-
     def rehash(self, method: str) -> None:
         """Make the hashes of an entry those of its score files, whatever these hold."""
         paths = read_entry(self.entry(method)).score_paths
@@ -427,7 +399,7 @@ class BoardBench:
         """Return path to hash of every file in the folder."""
         files = []
         for path in sorted(self.folder.rglob("*")):
-            if path.is_file() and path.name != LOCK:
+            if path.is_file() and path.name != ".lock":
                 files.append(path)
         hashes = {}
         for path in files:
@@ -484,13 +456,6 @@ def _worse(truth: Any, n: int, h: int) -> Any:
     return damped(truth, n, h) + 2.0 * error
 
 
-def nearer(truth: Any, n: int, h: int) -> Any:
-    """Predict the truth with half the error of ``noisy``."""
-    future = truth[n : n + h]
-    error = noisy(truth, n, h) - future
-    return future + 0.5 * error
-
-
 def copied(home: Path, folder: Path, *, without: Sequence[str] = ()) -> BoardBench:
     """Return the bench with a copy of the leaderboard that a test may damage.
 
@@ -507,37 +472,3 @@ def copied(home: Path, folder: Path, *, without: Sequence[str] = ()) -> BoardBen
     ignore = shutil.ignore_patterns(*patterns)
     shutil.copytree(shared.folder, target, ignore=ignore)
     return BoardBench(target, shared.data)
-
-
-def set_mean(content: dict[str, Any], factor: float = 0.9) -> None:
-    """Better the ranking metric of an entry."""
-    metrics = content["score"]["metrics"]
-    metrics["vorticity_rmse"]["mean"] *= factor
-
-
-def reform(
-    bench: BoardBench,
-    change: Callable[[Any], object],
-    *,
-    whole: bool = True,
-) -> None:
-    """Change the values of a score file; its hash and the aggregates follow."""
-    path = bench.folder / SCORES / "noisy.nc"
-    with netCDF4.Dataset(path, "r+") as file:
-        file.set_auto_maskandscale(False)
-        change(file)
-    if whole:
-        bench.forge("noisy")
-    else:
-        bench.rehash("noisy")
-
-
-def scale(statistic: str, factor: float) -> Callable[[Any], object]:
-    """Return a change that multiplies a statistic."""
-
-    def change(file: Any) -> None:
-        row = file.statistics.split().index(statistic)
-        values = file["value"]
-        values[row] = factor * values[row]
-
-    return change

@@ -75,7 +75,10 @@ SIZE = "tiny"
 SCORE_SCENARIOS = scorer.score_scenarios
 PAINT_PICTURES = cards.paint_pictures
 POOL_USERS = ("lagbench.make.generate.Pool", "lagbench.make.verify.Pool")
-VALIDATION_USERS = ("lagbench.scoring.score.validate", "lagbench.board.submit.validate")
+VALIDATION_USERS = (
+    "lagbench.scoring.score.validate",
+    "lagbench.board.submit.validate_predictions",
+)
 SCENARIO_SCORER = "lagbench.scoring.score.score_scenarios"
 PICTURE_PAINTER = "lagbench.make.cards.paint_pictures"
 

@@ -61,9 +61,9 @@ class ModelBoard:
             parameters=7,
         )
 
-    def submit(self, path: Path, **options: Any) -> None:
+    def submit(self, path: Path, *, method: str | None = None, **options: Any) -> None:
         """Submit predictions of gns."""
-        meta = Meta(authors=("A. Author",), command="make")
+        meta = Meta(authors=("A. Author",), command="make", method=method)
         submit(
             [path], meta, board=self.folder, root=self.root, new_board=True, **options
         )
@@ -76,7 +76,7 @@ class ModelBoard:
 
     def find(self, **options: Any) -> CheckResult:
         """Check the board."""
-        return check_board(self.folder, root=self.root, isolated=False, **options)
+        return check_board(self.folder, root=self.root, **options)
 
 
 def make_bench(folder: Path, root: Path, split: str = SPLIT) -> ModelBoard:

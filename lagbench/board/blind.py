@@ -24,8 +24,7 @@ from lagbench.work.run import Meter, Progress
 
 from .entry import Entry
 from .folder import Folder
-from .reproduce import name_seed, open_model, score_positions
-from .selection import choose_entries
+from .models import choose_entries, name_seed, open_model, predict_tallies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,14 +140,14 @@ def _score_entry(
             folder, entry, prediction, root=root, registry=registry, threads=threads
         )
         meter.begin(name, total=len(task.scenarios), scenarios=len(task.scenarios))
-        model_tallies = {}
         try:
-            for scenario in task.scenarios:
-                position = model.predict(task.truth.path(scenario))
-                model_tallies[scenario] = score_positions(
-                    task, scenario, position, metric.name
-                )
-                meter.count(1, scenarios=1)
+            model_tallies = predict_tallies(
+                model,
+                task,
+                metric.name,
+                task.scenarios,
+                done=lambda: meter.count(1, scenarios=1),
+            )
         finally:
             model.close()
         stored = read_score_file(folder.path / entry.score_paths[index])

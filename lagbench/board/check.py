@@ -1,38 +1,60 @@
 """Check a leaderboard's folder: ``lagbench leaderboard check``, for every pull request.
 
-All issues are reported together; one bad file hides nothing of the others. Nothing that
-strangers sent is run; their score files are first read in a child process under limits.
-Whoever makes every hash and number anew is found by scoring the predictions again, and
-by nothing else: verified.yaml names the entries for which that was done.
+All issues are reported together; one bad file hides nothing of the others. Whoever
+makes every hash and number anew is found by scoring the predictions again or running
+the model, and by nothing else: verified.yaml names the entries for which that was done.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.local import resolve_root
+import numpy as np
+
+from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size, load
-from lagbench.errors import LagbenchError, WorkFailedError
-from lagbench.references.shipped import shipped_path
-from lagbench.scoring.references import remeasure
+from lagbench.errors import ChecksFailedError, LagbenchError
+from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
+from lagbench.metrics.table import STATISTICS
+from lagbench.references.table import REFERENCES
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.scoring.score_file_checks import find_unreadable
-from lagbench.submission.issues import ValidationIssue
+from lagbench.scoring.score_file import SubmissionStatistics
+from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_file_writer import write_statistics
 from lagbench.work.run import Progress
 
-from .base import check_base
-from .build import build
-from .entry import Entry, Verification
-from .folder import Folder
-from .folder_checks import FolderChecks
-from .issues import issue_from_error, make_issue
-from .rescoring import Confirmation, Rescoring
-from .verified import record_verified
+from .entry import (
+    RELATIVE_TOLERANCE,
+    Entry,
+    Status,
+    Summary,
+    find_model,
+    is_current,
+    read_entry,
+)
+from .folder import SCORES, WEIGHTS, Folder, entry_path
+from .gates import read_failed_gates
+from .ranking import combine, summarise
+from .shift import check_shift
+from .verified import Level, Verification, check_verified, record
 
-MOST_METRICS = 3  # metrics that an issue names
+MOST_WEIGHTS = 40_000_000
+"""All weights of a leaderboard together [bytes]: git keeps every version for good."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Confirmation:
+    """Predictions that, scored again, gave the scores of an entry."""
+
+    predictions: Path
+    entry: str  # path of the entry in the leaderboard's folder
+    score_file: str
+    difference: float  # greatest relative difference of any statistic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,197 +63,306 @@ class CheckResult:
 
     folder: Path
     entries: int  # entries that were checked
-    findings: tuple[ValidationIssue, ...]
-    # whether the page was compared; it is not while anything else is wrong
-    page_checked: bool
-    # predictions that gave the same when scored again
+    findings: tuple[str, ...]  # what is wrong, a line each
     confirmed: tuple[Confirmation, ...] = ()
     recorded: tuple[str, ...] = ()  # entries that were added to verified.yaml
-    # entries of which some seeds were confirmed and others not scored: they are not
-    # added
-    partly: tuple[str, ...] = ()
-    # active entries whose models were run again and gave the same scores
-    reproduced_wholly: int = 0  # on all test scenarios
-    reproduced_partly: int = 0  # on a part of them
-    # reference predictors that were measured again, by data set, as in "cavity mini"
-    references: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
         """0 where nothing is wrong, else 1."""
-        if self.findings:
-            return 1
-        return 0
+        return 1 if self.findings else 0
 
 
 def check_board(
     board: str | Path,
     *,
     registry: Registry | None = None,
-    page: bool = False,
-    base: str | None = None,
-    own: Collection[str] = (),
-    isolated: bool = True,
     predictions: Sequence[str | Path] = (),
     recording: bool = False,
-    measured_sizes: Collection[Size] = (),
     root: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> CheckResult:
-    """Check entries, score files and aggregates of a leaderboard's folder.
+    """Check entries, score files and weights of a leaderboard's folder.
 
     Args:
         board: the leaderboard's folder.
         registry: where splits are described; ours when None.
-        page: whether to compare the page, too, where all else is right.
-        base: git revision; entries there that the folder alters are issues.
-        own: methods whose entries the change may alter.
-        isolated: whether a child process reads score files first.
         predictions: files of predictions of entries, which are scored again.
         recording: whether to note confirmed entries in verified.yaml.
-        measured_sizes: sizes whose shipped scores of reference predictors are measured
-            again.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         progress: called as the work advances.
 
     Raises:
-        UsageError: no leaderboard, or ``base`` is no revision of its repository.
-        WorkFailedError: a worker that forms the page was lost.
+        UsageError: no leaderboard.
     """
     folder = Folder(board)
-    full_registry = registry or load()
     folder.require()
+    known = registry or load()
+    issues = [
+        f"{path}: not part of a leaderboard; remove it" for path in folder.misplaced()
+    ]
+    entries: dict[str, Entry] = {}
+    for path in folder.entries():
+        try:
+            entry = read_entry(folder.path / path)
+            size = known.size(entry.split, entry.size)
+        except LagbenchError as error:
+            issues.append(str(error))
+            continue
+        entries[path.as_posix()] = entry
+        issues += check_entry(folder, path, entry, size)
+    for path in folder.reference_files():
+        issues += _check_reference(folder, path, known)
 
-    checks = FolderChecks(
-        folder=folder,
-        registry=full_registry,
-        unreadable=_find_unreadable(folder) if isolated else {},
-    )
-    checks.run()
-    issues = [*checks.issues]
-    if base is not None:
-        issues += check_base(folder, base, own)
+    issues += _check_strays(folder, entries)
+    issues += check_verified(folder, entries)
+    issues += check_shift(folder, entries, known)
+    try:
+        read_failed_gates(folder)
+    except LagbenchError as error:
+        issues.append(str(error))
 
-    score_predictions = partial(
-        score,
-        root=root,
-        packages=False,
-        registry=full_registry,
-        progress=progress,
-        write=False,
-    )
-    rescoring = Rescoring(
-        folder=folder,
-        entries=checks.entries,
-        readable_score_files=checks.readable_score_files,
-        score=score_predictions,
-    )
-    for path in predictions:
-        issues += rescoring.rescore(path)
-    references, issues_of_references = _measure_references(
-        measured_sizes, root, progress
-    )
-    issues += issues_of_references
-
-    confirmed, partly = _group_confirmed(checks.entries, rescoring.confirmations)
-    recorded: list[Entry] = []
+    confirmed = []
+    for path in map(Path, predictions):
+        card = score(
+            path,
+            root=root,
+            packages=False,
+            registry=registry,
+            progress=progress,
+            write=False,
+        )
+        try:
+            confirmed.append(_rescore(folder, path, card, entries))
+        except ChecksFailedError as error:
+            issues.append(str(error))
+    recorded = []
     if recording and not issues:
-        recorded = confirmed
-    record_verified(folder, recorded)
-
-    is_page_checked = page and not issues
-    if is_page_checked:
-        issues += _check_page(folder, full_registry)
-    reproduced_wholly, reproduced_partly = _count_reproduced(checks.verifications)
+        files = {one.score_file for one in confirmed}
+        for name, entry in entries.items():
+            if files.issuperset(path.as_posix() for path in entry.score_paths):
+                record(folder, entry, _raise_to_scored_again)
+                recorded.append(name)
     return CheckResult(
         folder=folder.path,
         entries=len(folder.entries()),
         findings=tuple(issues),
-        page_checked=is_page_checked,
-        confirmed=tuple(rescoring.confirmations),
-        recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
-        partly=partly,
-        reproduced_wholly=reproduced_wholly,
-        reproduced_partly=reproduced_partly,
-        references=references,
+        confirmed=tuple(confirmed),
+        recorded=tuple(recorded),
     )
 
 
-def _find_unreadable(folder: Folder) -> Mapping[Path, str]:
-    """Return the score files that a child process cannot read, and why."""
-    paths = (*folder.score_files(), *folder.reference_files())
-    whole_paths = []
-    for path in paths:
-        whole_paths.append(folder.path / path)
-    return find_unreadable(whole_paths)
+def check_entry(folder: Folder, path: Path, entry: Entry, size: Size) -> Iterator[str]:
+    """Yield what is wrong with an entry, its score files and its weights."""
+    if entry.yaml_path != path:
+        yield f"{path}: the entry belongs to {entry.yaml_path}; move it there"
+        return
+    current = is_current(entry.dataset, size)
+    if entry.status is Status.ACTIVE and not current:
+        yield (
+            f"{path}: the data set has version {size.version}, the entry is of "
+            f"{entry.dataset.version}; predict again, or set status: withdrawn"
+        )
+    if entry.name in REFERENCES:
+        yield f"{path}: {entry.name} is the name of a reference predictor"
+    successor = entry.superseded_by
+    if successor is not None:
+        place = (entry.split, entry.size, successor)
+        if not (folder.path / entry_path(place)).is_file():
+            yield f"{path}: superseded_by names {successor}, which is not there"
+    for prediction in entry.predictions:
+        provenance = prediction.provenance
+        if provenance is not None and {"test", "shift"} & set(provenance.subsets):
+            yield f"{path}: the model was trained on scored scenarios"
+        if prediction.weights is not None:
+            try:
+                find_model(folder, prediction.weights)
+            except LagbenchError as error:
+                yield str(error)
+
+    stored = []
+    for score_path, file, prediction in zip(
+        entry.score_paths, entry.score.files, entry.predictions, strict=True
+    ):
+        whole_path = folder.path / score_path
+        if not whole_path.is_file() or file_sha256(whole_path) != file.sha256:
+            yield (
+                f"{score_path}: not the score file that {path} names, or missing; "
+                "restore it, or submit again"
+            )
+            continue
+        try:
+            scores = read_score_file(whole_path, size if current else None).scores
+        except LagbenchError as error:
+            yield str(error)
+            continue
+        expected = {
+            "split": entry.split,
+            "size": entry.size,
+            "dataset_sha256": entry.dataset.sha256,
+            "predictions_sha256": prediction.sha256,
+        }
+        found = {**scores.identity, "predictions_sha256": scores.predictions_sha256}
+        for name, value in expected.items():
+            if found[name] != value:
+                yield f"{score_path}: {name} {ascii(found[name])[:80]}, not {value}"
+        stored.append(scores)
+    if len(stored) == len(entry.predictions):
+        yield from _check_score_block(path, entry, stored)
 
 
-def _measure_references(
-    sizes: Collection[Size],
-    root: str | Path | None,
-    progress: Callable[[Progress], None] | None,
-) -> tuple[dict[str, tuple[str, ...]], list[ValidationIssue]]:
-    """Measure reference predictors again.
+def _check_score_block(
+    path: Path, entry: Entry, stored: Sequence[SubmissionStatistics]
+) -> Iterator[str]:
+    """Compare the score block of an entry with its score files."""
+    first = stored[0]
+    for scores in stored[1:]:
+        if sorted(scores.tallies) != sorted(first.tallies):
+            yield f"{path}: the score files of its seeds have other scenarios"
+            return
+    if entry.score.ranking_metric != first.ranking:
+        yield f"{path}: ranking_metric is not {first.ranking}"
+    formed = summarise(combine([scores.tallies for scores in stored]))
+    for name, summary in formed.items():
+        stated = entry.score.metrics.get(name)
+        if stated is None or not _is_same_summary(summary, stated):
+            yield f"{path}, score: {name} is not that of the score files; submit again"
+            return
+
+
+def _is_same_summary(first: Summary, second: Summary) -> bool:
+    for (_, a), (_, b) in zip(first, second, strict=True):
+        if a is None or b is None:
+            if a is not b:
+                return False
+        elif not math.isclose(a, b, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-300):
+            return False
+    return True
+
+
+def _check_reference(folder: Folder, path: Path, registry: Registry) -> Iterator[str]:
+    """Yield why a file cannot hold the scores of a reference predictor."""
+    try:
+        size = registry.size(*path.parts[1:3])
+        read_score_file(folder.path / path, size)
+    except LagbenchError as error:
+        yield str(error)
+        return
+    if path.stem not in REFERENCES:
+        yield f"{path}: no reference predictor has this name; remove the file"
+
+
+def _check_strays(folder: Folder, entries: Mapping[str, Entry]) -> Iterator[str]:
+    """Yield files that no entry names, and weights beyond the size of all."""
+    named: set[Path] = set()
+    for entry in entries.values():
+        named.update(entry.score_paths)
+        for prediction in entry.predictions:
+            if prediction.weights is not None:
+                path = Path(prediction.weights.path)
+                named |= {path, path.with_suffix(".json")}
+    if len(entries) == len(folder.entries()):
+        for path in (*folder.files(SCORES), *folder.files(WEIGHTS)):
+            if path not in named:
+                yield f"{path}: no entry names it; remove it"
+    total = 0
+    for path in folder.files(WEIGHTS):
+        total += (folder.path / path).stat().st_size
+    if total > MOST_WEIGHTS:
+        yield (
+            f"the weights have {total} bytes, at most {MOST_WEIGHTS} in all; name "
+            "larger ones by `weights: https://...` in the entry"
+        )
+
+
+def _raise_to_scored_again(line: Verification) -> Verification:
+    if line.level is not Level.AS_SUBMITTED:
+        return line
+    return line.model_copy(update={"level": Level.SCORED_AGAIN})
+
+
+def _rescore(
+    folder: Folder, path: Path, card: ScoreCard, entries: Mapping[str, Entry]
+) -> Confirmation:
+    """Compare predictions that were scored again with the entry that has them.
+
+    Raises:
+        ChecksFailedError: no entry has them, or its statistics are others.
+    """
+    for name, entry in entries.items():
+        for file, score_path in zip(entry.score.files, entry.score_paths, strict=True):
+            if file.predictions_sha256 != card.predictions_sha256:
+                continue
+            stored = read_score_file(folder.path / score_path).scores
+            with tempfile.TemporaryDirectory() as scratch:
+                new_path = Path(scratch) / "scores.nc"
+                write_statistics(card, new_path)
+                scored = read_score_file(new_path).scores
+            differing, difference = compare_tallies(scored.tallies, stored.tallies)
+            if differing:
+                raise ChecksFailedError(
+                    f"{path}: scored again, {', '.join(differing[:5])} are not those "
+                    f"of {score_path}"
+                )
+            return Confirmation(
+                predictions=path,
+                entry=name,
+                score_file=score_path.as_posix(),
+                difference=difference,
+            )
+    raise ChecksFailedError(f"{path}: no entry has these predictions")
+
+
+def compare_tallies(
+    first: Mapping[int, Tally], second: Mapping[int, Tally]
+) -> tuple[list[str], float]:
+    """Compare the statistics of two sets of scenarios.
+
+    Statistics of packages that one side lacks are on no board, and not compared.
 
     Returns:
-        Names of the measured ones by data set, and those with other shipped scores.
+        Names of the statistics that differ, and the greatest relative difference of the
+        others.
     """
-    measured = {}
-    issues = []
-    for size in sizes:
-        names, differing = remeasure(size, resolve_root(root), progress=progress)
-        measured[f"{size.split} {size.name}"] = names
-        issues += _issues_of_measured(size, differing)
-    return measured, issues
+    if {i: tuple(tally.frames) for i, tally in first.items()} != {
+        i: tuple(tally.frames) for i, tally in second.items()
+    }:
+        return ["scenarios or frames"], np.inf
+    first_tally = next(iter(first.values()))
+    second_tally = next(iter(second.values()))
+    tolerance = RELATIVE_TOLERANCE
+    if len(second_tally.frames) > LONG_ROLLOUT:
+        # the last bits may have pushed a value over to the next step of its rounding
+        tolerance = 2.0 ** (1 - LONG_BITS)
+
+    differing = []
+    greatest = 0.0
+    names = {*first_tally.names, *second_tally.names}
+    for name in sorted(names.intersection(STATISTICS)):
+        difference = 0.0
+        for scenario, tally in first.items():
+            distance = relative_distance(tally, second[scenario], name)
+            difference = max(difference, distance)
+        if difference > tolerance:
+            differing.append(name)
+        else:
+            greatest = max(greatest, difference)
+    return differing, greatest
 
 
-def _check_page(folder: Folder, registry: Registry) -> list[ValidationIssue]:
-    """Return the issue of a page that is not what the entries give, if it is one."""
-    try:
-        build(folder.path, check=True, registry=registry)
-    except WorkFailedError:  # this machine failed, so nothing is known of the page
-        raise
-    except LagbenchError as error:
-        return [issue_from_error("page", error, error.where)]
-    return []
+def relative_distance(first: Tally, second: Tally, name: str) -> float:
+    """Return the greatest relative difference of a statistic in a scenario.
 
-
-def _count_reproduced(verifications: Iterable[Verification]) -> tuple[int, int]:
-    """Return how many entries were reproduced on all scenarios, and on some."""
-    wholly = 0
-    partly = 0
-    for verification in verifications:
-        if verification.is_reproduced_wholly:
-            wholly += 1
-        elif verification.is_reproduced:
-            partly += 1
-    return wholly, partly
-
-
-def _issues_of_measured(
-    size: Size, differing: Mapping[str, Sequence[str]]
-) -> list[ValidationIssue]:
-    """Return the reference predictors whose shipped scores are not those measured."""
-    issues = []
-    for name, metrics in differing.items():
-        got = f"other {', '.join(metrics[:MOST_METRICS])}"
-        if len(metrics) > MOST_METRICS:
-            got += f" and {len(metrics) - MOST_METRICS} more metrics"
-        where = f"{shipped_path(size).name}, {name}"
-        issues.append(make_issue("measured", where, got))
-    return issues
-
-
-def _group_confirmed(
-    entries: Sequence[Entry], confirmations: Sequence[Confirmation]
-) -> tuple[list[Entry], tuple[str, ...]]:
-    """Return the entries with all seeds confirmed, and paths of those with some."""
-    confirmed_files = {confirmation.score_file for confirmation in confirmations}
-    whole = []
-    for entry in entries:
-        if confirmed_files.issuperset(entry.score_paths):
-            whole.append(entry)
-    whole_paths = {entry.yaml_path for entry in whole}
-    touched_paths = {confirmation.entry for confirmation in confirmations}
-    partly = sorted(path.as_posix() for path in touched_paths - whole_paths)
-    return whole, tuple(partly)
+    Infinite where one side lacks it or has gaps at other frames.
+    """
+    if name not in first.names or name not in second.names:
+        return np.inf
+    a = first.series(name).astype(np.float32).astype(np.float64)
+    b = second.series(name).astype(np.float32).astype(np.float64)
+    has_same_frames = np.array_equal(first.measured(name), second.measured(name))
+    if not has_same_frames or not np.array_equal(np.isnan(a), np.isnan(b)):
+        return np.inf
+    is_unequal = a != b
+    scale = np.maximum(np.abs(a[is_unequal]), np.abs(b[is_unequal]))
+    relative = np.abs(a[is_unequal] - b[is_unequal]) / scale
+    return float(np.nanmax(relative, initial=0.0))

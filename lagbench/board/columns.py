@@ -1,624 +1,340 @@
-"""Columns of the board's tables, the values of rows in them, and presets of columns."""
+"""Columns of the board's tables: for each its name, meaning, value and text."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import numpy as np
+from lagbench.metrics.metric import Direction, Metric
+from lagbench.metrics.table import METRICS
 
-from lagbench.figures.numbers import MISSING, sentence, text, words
-from lagbench.metrics.metric import Direction, Metric, mean
+from .rows import Row, Value
+from .verified import Level
 
-from .entry import EntryBudget, EntryCost, Level
-from .model import BoardRow, ReferenceRow, Tab, Value
-
-TableRow = BoardRow | ReferenceRow
-
-MAIN_METRICS = 4
-"""Metrics of the first table, the ranking one among them; with more it would be wider
-than a screen.
-"""
-
-PRESETS: Mapping[str, tuple[str, ...]] = {
+METRIC_GROUPS = {
     "position": (
-        "motion_distance",
-        "cloud_distance",
-        "position_rmse_20",
-        "position_rmse",
-        "position_mae",
-        "velocity_rmse",
-        "velocity_mae",
-        "attribute_mse",
-        "mse_avg",
-        "mse_end",
-        "sliced_w2",
-        "sinkhorn",
-        "sinkhorn_pot",
-        "position_rmse_liquid",
-        "position_rmse_jelly",
-        "position_rmse_snow",
-        "position_rmse_rope",
+        *("cloud_distance", "position_rmse_20", "position_rmse", "velocity_rmse"),
+        *("mse_avg", "mse_end", "sliced_w2", "sinkhorn"),
     ),
     "vorticity": (
-        "vorticity_nrmse",
-        "vorticity_rmse",
-        "vorticity_mae",
-        "vorticity_pearson",
-        "stable_frames",
-        "spectrum_error",
-        "vorticity_residual_std",
-        "vorticity_residual_max",
-        "vorticity_residual_slope",
-        "vorticity_kl",
-        "vorticity_kl_hist",
-        "vorticity_w1",
+        *("vorticity_nrmse", "vorticity_rmse", "vorticity_pearson", "stable_frames"),
+        *("spectrum_error", "vorticity_residual_std", "vorticity_kl", "vorticity_w1"),
     ),
-    "energy": (
-        "energy_error",
-        "energy_ratio",
-        "energy_retention",
-        "energy_retention_true",
-        "energy_predicted",
-        "energy_true",
-    ),
-    "conservation": (
-        "momentum_error",
-        "angular_momentum_error",
-        "density_rmse",
-        "divergence_rms",
-        "divergence_rms_true",
-        "shape_error",
-        "connectivity",
-    ),
-    "training": (
-        "track",
-        "windows",
-        "epochs",
-        "cpu_hours",
-        "gpu_hours",
-        "parameters",
-        "seeds",
-    ),
-    "cost": (
-        "speed_up",
-        "seconds_per_frame",
-        "cost_source",
-        "solver_seconds_per_frame",
-        "parameters",
-        "device",
+    "energy and conservation": (
+        *("energy_error", "energy_ratio", "momentum_error", "density_rmse"),
+        *("divergence_rms", "shape_error", "connectivity"),
     ),
 }
-"""Columns by preset; those that a data set lacks are left out, the ranking one stands
-first.
-"""
+"""Metrics of the tables, by group; those that a data set lacks are left out."""
 
-COUNT_UNITS = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+SHOWN_METRICS = frozenset(name for group in METRIC_GROUPS.values() for name in group)
+
+REPORTED = "*"
+"""Behind a time of a frame that only the submitter took."""
+
+NOTHING = "–"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """What a column shows of a row."""
+
+    text: str
+    order: float = math.nan  # by which rows are sorted; NaN without a value
+    note: str = ""  # in a second, smaller line
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
     """One column."""
 
-    key: str  # unique name, that of the metric where it shows one
+    key: str
     label: str
-    unit: str = ""
+    group: str
+    meaning: str
+    read: Callable[[Row], Cell]
+    # direction in which values are better; NONE where nothing is judged
     direction: Direction = Direction.NONE
     perfect: float | None = None
-    form: str = "number"  # how cells are written: number, count, factor or text
-    reported: bool = False  # stated by the submitter, computed again by nobody
-    # of the cost of a frame, which is measured or stated: the column "time taken by"
-    # says which
-    of_cost: bool = False
-    meaning: str
-    # value of a row, where metric_value has none
-    read: Callable[[TableRow], object] | None = None
 
-    @property
-    def quantity(self) -> str:
-        """Label and unit, as an axis has them."""
-        if self.unit:
-            return f"{self.label} [{self.unit}]"
-        return self.label
-
-    def loss(self, value: float) -> float:
-        """Return the value turned so that smaller is better; NaN where nothing is
-        judged.
-        """
+    def loss(self, order: float) -> float:
+        """Return a value turned so that smaller is better; NaN without a judgement."""
         if self.direction is Direction.TARGET and self.perfect is not None:
-            return abs(value - self.perfect)
+            return abs(order - self.perfect)
         if self.direction is Direction.LOWER:
-            return value
+            return order
         if self.direction is Direction.HIGHER:
-            return -value
+            return -order
         return math.nan
 
 
-def cost_of(row: TableRow) -> EntryCost | None:
-    """Return the cost of a frame: ours where we measured it, else the stated one."""
-    if isinstance(row, ReferenceRow):
-        return row.cost
-    if row.verified is not None and row.verified.cost is not None:
-        measured = row.verified.cost
-        return EntryCost.model_construct(
-            seconds_per_frame=measured.seconds_per_frame,
-            device=measured.machine,
-            solver_seconds_per_frame=measured.solver,
-        )
-    return row.entry.cost
+def format_number(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many significant digits.
 
-
-def _read_cost(key: str) -> Callable[[TableRow], object]:
-    """Return a function that reads a part of a row's cost."""
-    return lambda row: getattr(cost_of(row), key, None)
-
-
-def _read_entry(key: str) -> Callable[[TableRow], object]:
-    """Return a function that reads a key of a row's entry."""
-
-    def read(row: TableRow) -> object:
-        if isinstance(row, ReferenceRow):
-            return None
-        return getattr(row.entry, key)
-
-    return read
-
-
-def _read_budget(key: str) -> Callable[[TableRow], object]:
-    """Return a function that reads a part of a row's budget."""
-    read_budget = _read_entry("budget")
-    return lambda row: getattr(read_budget(row), key, None)
-
-
-def _describe_budget(row: TableRow) -> str:
-    """Return the computing time of one training in words."""
-    if isinstance(row, ReferenceRow) or row.entry.budget is None:
-        return ""
-    budget: EntryBudget = row.entry.budget
-    hours = []
-    if budget.cpu_hours:
-        hours.append(f"{text(budget.cpu_hours)} CPU h")
-    if budget.gpu_hours:
-        hours.append(f"{text(budget.gpu_hours)} GPU h")
-    if hours:
-        return " + ".join(hours)
-    if budget.windows:
-        return f"{_format_count(float(budget.windows))} windows"
-    return ""
-
-
-def _read_kind(row: TableRow) -> str:
-    if isinstance(row, ReferenceRow):
-        return str(row.kind)
-    return str(row.entry.kind)
-
-
-def _read_solver(row: TableRow) -> str | None:
-    if isinstance(row, ReferenceRow):
-        return None
-    return row.solver
-
-
-def _count_seeds(row: TableRow) -> int | None:
-    if isinstance(row, ReferenceRow):
-        return None
-    return len(row.entry.predictions)
-
-
-SHORT_LEVELS = {Level.REPRODUCED: "repr."}
-"""Levels that have other names in narrow tables."""
-
-
-def level_of(row: BoardRow) -> Level:
-    """Return how far the maintainers followed the scores of an entry."""
-    if row.verified is None:
-        return Level.AS_SUBMITTED
-    return row.verified.level
-
-
-def describe_check(row: BoardRow, *, is_short: bool = False) -> str:
-    """Return in words how far the scores of an entry were followed.
-
-    Short texts are those of narrow tables, as in ``repr. 2/16``.
+    >>> format_number(0.012345), format_number(123456.0), format_number(None)
+    ('0.0123', '1.23e+05', '–')
     """
+    if value is None or math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞"
+    if 1e3 <= abs(value) < 1e5:
+        return f"{value:.0f}"
+    return f"{value:.{digits}g}"
+
+
+def value_cell(value: Value | None) -> Cell:
+    """Return a value with its 95 % interval."""
+    if value is None or math.isnan(value.mean):
+        return Cell(text=NOTHING)
+    note = ""
+    if not math.isnan(value.low + value.high):
+        note = f"{format_number(value.low)} … {format_number(value.high)}"
+    return Cell(text=format_number(value.mean), order=value.mean, note=note)
+
+
+def _rank(row: Row) -> Cell:
+    if row.rank is None:
+        return Cell(text="")
+    text = str(row.rank)
+    if row.tied:
+        text += " ≈"
+    note = ""
+    if row.rank_range is not None and row.rank_range[0] < row.rank_range[1]:
+        note = f"{row.rank_range[0]}–{row.rank_range[1]}"
+    return Cell(text=text, order=row.rank, note=note)
+
+
+def _method(row: Row) -> Cell:
+    notes = [str(row.kind)]
+    if row.failed_gates:
+        notes.append("under-trained")
+    if row.diverged:
+        notes.append(f"{row.diverged} diverged")
+    notes += row.flags
+    return Cell(text=row.name, note=", ".join(notes))
+
+
+def _score(row: Row) -> Cell:
+    return value_cell(row.score)
+
+
+def _skill(row: Row) -> Cell:
+    return value_cell(row.skill)
+
+
+def _shift(row: Row) -> Cell:
+    return value_cell(row.shift_skill)
+
+
+def _speedup(row: Row) -> Cell:
+    if row.speedup is None:
+        return Cell(text=NOTHING if row.entry is not None else "")
+    speedup = row.speedup
+    sign = "> " if speedup.at_least else ""
+    cell = value_cell(
+        Value(mean=speedup.value, low=speedup.interval[0], high=speedup.interval[1])
+    )
+    return Cell(text=f"{sign}{cell.text}", order=cell.order, note=cell.note)
+
+
+def _breakeven(row: Row) -> Cell:
+    if row.breakeven is None:
+        return Cell(text=NOTHING if row.entry is not None else "")
+    if math.isinf(row.breakeven):
+        return Cell(text="never", order=math.inf)
+    return Cell(text=format_number(row.breakeven), order=row.breakeven)
+
+
+def _milliseconds(row: Row) -> Cell:
+    if row.seconds is None:
+        return Cell(text=NOTHING)
+    milliseconds = 1e3 * row.seconds
+    is_reported = row.entry is not None and (
+        row.verified is None or row.verified.cost is None
+    )
+    text = format_number(milliseconds)
+    return Cell(text=text + (REPORTED if is_reported else ""), order=milliseconds)
+
+
+def describe_check(row: Row) -> str:
+    """Return how far the maintainers followed the scores of an entry."""
+    if row.entry is None:
+        return ""
     if row.verified is None:
         return str(Level.AS_SUBMITTED)
-    level = row.verified.level
-    reproductions = row.verified.reproduced
-    reproduced = SHORT_LEVELS[Level.REPRODUCED] if is_short else str(Level.REPRODUCED)
-    if any(not reproduction.agrees for reproduction in reproductions):
-        return f"not {reproduced}"
-    if level.rank < Level.REPRODUCED.rank and reproductions:
-        seeds = len(row.entry.predictions)
-        if is_short:
-            return f"{reproduced} {len(reproductions)}/{seeds} seeds"
-        return f"{len(reproductions)} of {seeds} seeds reproduced"
-    name = SHORT_LEVELS.get(level, str(level)) if is_short else str(level)
-    if reproductions and not row.verified.is_reproduced_wholly:
-        least = min(reproductions, key=lambda reproduction: reproduction.scenarios)
-        if is_short:
-            return f"{name} {least.scenarios}/{least.of}"
-        return f"{name}, {least.scenarios} of {least.of} scenarios"
-    return name
+    models = row.verified.reproduced
+    if any(not model.agrees for model in models):
+        return "not reproduced"
+    text = str(row.verified.level)
+    if models and not row.verified.is_complete:
+        least = min(models, key=lambda model: model.scenarios)
+        text += f", {least.scenarios} of {least.of} scenarios"
+    return text
 
 
-def _describe_check(row: TableRow) -> str:
-    if isinstance(row, ReferenceRow):
-        return ""
-    return describe_check(row)
+def _parameters(row: Row) -> Cell:
+    if row.entry is None or row.entry.parameters is None:
+        return Cell(text="")
+    count = row.entry.parameters
+    text = str(count)
+    if count >= 10_000:
+        text = f"{count / 1e6:.2g} M" if count >= 1e6 else f"{count / 1e3:.0f} k"
+    return Cell(text=text, order=float(count))
 
 
-SELF_REPORTED = "self-reported"
-"""Source of a cost that the submitter states and nobody measured."""
+def _seeds(row: Row) -> Cell:
+    if row.entry is None:
+        return Cell(text="")
+    return Cell(text=str(len(row.seeds)), order=float(len(row.seeds)))
 
 
-def source_of_cost(row: TableRow) -> str:
-    """Return who took the time of a frame; empty where nobody did."""
-    if isinstance(row, ReferenceRow):
-        return "measured" if row.cost else ""
-    if row.verified is not None and row.verified.cost is not None:
-        return "measured"
-    return SELF_REPORTED if row.entry.cost else ""
+def _training(row: Row) -> Cell:
+    if row.entry is None or row.entry.budget is None:
+        return Cell(text="")
+    budget = row.entry.budget
+    hours = (budget.cpu_hours or 0.0) + (budget.gpu_hours or 0.0)
+    if not hours:
+        return Cell(text="", note=budget.track or "")
+    where = "GPU h" if budget.gpu_hours else "h"
+    text = f"{format_number(hours, 2)} {where}"
+    return Cell(text=text, order=hours, note=budget.track or "")
 
 
-def format_ranks(rank: int, ranks: tuple[int, int] | None) -> str:
-    """Return a range of ranks, or the rank where nothing is claimed.
-
-    >>> format_ranks(2, (1, 3)), format_ranks(2, (2, 2)), format_ranks(2, None)
-    ('1–3', '2', '2')
-    """
-    if ranks is None or ranks[0] == ranks[1]:
-        return str(rank)
-    return f"{ranks[0]}–{ranks[1]}"
-
-
-SKILL = Column(
-    key="skill",
-    label="skill",
-    direction=Direction.HIGHER,
-    perfect=1.0,
-    meaning="1 - score / score of the best naive baseline, by the ranking metric: 0 is "
-    "nothing learned, 1 perfect.",
-)
-
-AGAINST_CLASSICAL = Column(
-    key="against_classical",
-    label="÷ classical",
-    direction=Direction.LOWER,
-    meaning="Score over that of the best classical solver that costs no more per frame:"
-    " below 1 the method is more accurate. Where every classical solver costs more, the"
-    " cheapest one takes its place. Empty where the entry states no cost.",
-)
-
-HAS_GAPS = "†"
-"""Behind a mean: some frames have no value."""
-
-SOLVER_COSTS_MORE = "‡"
-"""Behind a ratio to a classical solver that costs more than the model."""
-
-SKILL_ON_SHIFT = Column(
-    key="skill_on_shift",
-    label="skill on shift",
-    direction=Direction.HIGHER,
-    perfect=1.0,
-    meaning="Skill on the subset shift, which lies outside train on purpose; it does "
-    "not rank.",
-)
-
-SCORE_ON_SHIFT = Column(
-    key="score_on_shift",
-    label="score on shift",
-    direction=Direction.LOWER,
-    meaning="The ranking metric on the subset shift, which lies outside train.",
-)
-
-ENTRY_COLUMNS = (
+MAIN_COLUMNS = (
     Column(
-        key="kind",
-        label="kind",
-        form="text",
-        meaning="Naive: learns nothing and integrates no equations. Classical:"
-        " integrates the equations. Learned: fitted to train. Hybrid: a solver with a"
-        " learned part.",
-        read=_read_kind,
+        key="rank",
+        label="rank",
+        group="main",
+        meaning="Entries that differ by less than the truth error share a rank. Below "
+        "it: the range in 95 % of the resamples. ≈: cannot be told from the leader.",
+        read=_rank,
     ),
     Column(
-        key="solver",
-        label="classical solver",
-        form="text",
-        meaning="The best classical solver that costs no more per frame. Where all cost"
-        " more, the cheapest one.",
-        read=_read_solver,
+        key="method",
+        label="method",
+        group="",
+        meaning="Shaded rows are reference predictors, which have no rank.",
+        read=_method,
     ),
     Column(
-        key="speed_up",
-        label="speed\u2011up",
-        form="factor",
-        direction=Direction.HIGHER,
-        of_cost=True,
-        meaning="Time of the solver over that of the model per frame.",
-        read=_read_cost("speed_up"),
-    ),
-    Column(
-        key="seconds_per_frame",
-        label="time per frame",
-        unit="s",
+        key="score",
+        label="score",
+        group="main",
+        meaning="The metric that ranks, and its 95 % interval.",
+        read=_score,
         direction=Direction.LOWER,
-        of_cost=True,
-        meaning="Wall time of a frame of one scenario.",
-        read=_read_cost("seconds_per_frame"),
     ),
     Column(
-        key="cost_source",
-        label="time taken by",
-        form="text",
-        meaning="Measured: we timed it on one core, an entry in one run with the "
-        "simulator and the classical solvers. Self-reported: the submitter states it.",
-        read=source_of_cost,
+        key="skill",
+        label="skill",
+        group="main",
+        meaning="1 - score / score of the best naive baseline.",
+        read=_skill,
+        direction=Direction.HIGHER,
     ),
     Column(
-        key="solver_seconds_per_frame",
-        label="solver time per frame",
-        unit="s",
-        of_cost=True,
-        meaning="On the same machine.",
-        read=_read_cost("solver_seconds_per_frame"),
+        key="milliseconds",
+        label="ms per frame",
+        group="main",
+        meaning="Processor time of a frame on one core, all rows in one run. *: stated "
+        "by the submitter.",
+        read=_milliseconds,
     ),
     Column(
-        key="device",
-        label="device",
-        form="text",
-        of_cost=True,
-        meaning="Machine of both times.",
-        read=_read_cost("device"),
+        key="speedup",
+        label="speedup",
+        group="main",
+        meaning="Cost of the classical side at the method's error / cost of the method."
+        " >: no classical row is as accurate. Learning pays where the interval of a "
+        "model is above 1.",
+        read=_speedup,
+    ),
+    Column(
+        key="breakeven",
+        label="break-even",
+        group="main",
+        meaning="Scenarios to predict before the model was worth its training and the "
+        "data for it.",
+        read=_breakeven,
+    ),
+    Column(
+        key="shift",
+        label="skill on shift",
+        group="main",
+        meaning="Skill on the subset shift, which lies outside train on purpose.",
+        read=_shift,
+        direction=Direction.HIGHER,
     ),
     Column(
         key="parameters",
         label="parameters",
-        form="count",
-        reported=True,
-        meaning="Trainable parameters of the model.",
-        read=_read_entry("parameters"),
-    ),
-    Column(
-        key="budget",
-        label="budget",
-        form="text",
-        reported=True,
-        meaning="Computing time of one training.",
-        read=_describe_budget,
-    ),
-    Column(
-        key="track",
-        label="track",
-        form="text",
-        reported=True,
-        meaning="Equal compute for all, or trained until it no longer helped.",
-        read=_read_budget("track"),
-    ),
-    Column(
-        key="windows",
-        label="windows",
-        form="count",
-        reported=True,
-        meaning="Training windows seen.",
-        read=_read_budget("windows"),
-    ),
-    Column(
-        key="epochs",
-        label="epochs",
-        reported=True,
-        meaning="Passes over the training subset.",
-        read=_read_budget("epochs"),
-    ),
-    Column(
-        key="cpu_hours",
-        label="CPU time",
-        unit="h",
-        reported=True,
-        meaning="Of one training.",
-        read=_read_budget("cpu_hours"),
-    ),
-    Column(
-        key="gpu_hours",
-        label="GPU time",
-        unit="h",
-        reported=True,
-        meaning="Of one training.",
-        read=_read_budget("gpu_hours"),
+        group="training",
+        meaning="Trainable parameters, as the submitter states.",
+        read=_parameters,
     ),
     Column(
         key="seeds",
         label="seeds",
-        form="count",
+        group="training",
         meaning="Trainings behind the row; with one it speaks of these weights only.",
-        read=_count_seeds,
+        read=_seeds,
+    ),
+    Column(
+        key="training",
+        label="training",
+        group="training",
+        meaning="Processor time of one training, as the submitter states.",
+        read=_training,
     ),
     Column(
         key="checked",
-        label="scores",
-        form="text",
-        meaning="How far the maintainers followed the scores: as submitted (not at "
-        "all), scored again from the submitter's predictions, or reproduced from "
-        "the model.",
-        read=_describe_check,
-    ),
-    Column(
-        key="date",
-        label="date",
-        form="text",
-        meaning="Of the submission.",
-        read=_read_entry("date"),
+        label="checked",
+        group="training",
+        meaning="As submitted, scored again from the predictions, or reproduced from "
+        "the model by the maintainers.",
+        read=lambda row: Cell(text=describe_check(row)),
     ),
 )
-"""Columns that show no metric."""
 
 
-def comparisons_of(tab: Tab) -> tuple[Column, ...]:
-    """Return the columns of a tab that compare with other methods or other data.
-
-    Of the skill, the score divided by the classical one, and the skill on shift, those
-    that a row has.
-    """
-    columns = []
-    if any(row.skill is not None for row in tab.rows):
-        columns.append(SKILL)
-    if any(row.against_classical is not None for row in tab.rows):
-        columns.append(AGAINST_CLASSICAL)
-    if any(row.on_shift is not None for row in tab.rows):
-        columns.append(SKILL_ON_SHIFT)
-    return tuple(columns)
-
-
-def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
-    """Return all columns of a tab by key.
-
-    The skill comes first, then the metrics to show at first, the other metrics, and the
-    columns that show no metric.
-    """
-    columns = {column.key: column for column in comparisons_of(tab)}
-    if SKILL_ON_SHIFT.key in columns:
-        columns[SCORE_ON_SHIFT.key] = SCORE_ON_SHIFT
-    for name in dict.fromkeys((*tab.columns, *metrics)):
-        if any(name in row.values for row in tab.lines):
-            columns[name] = _metric_column(metrics[name])
-    for column in ENTRY_COLUMNS:
-        columns[column.key] = column
-    return columns
-
-
-def _metric_column(metric: Metric) -> Column:
-    """Return the column of a metric; the unit 1 is not shown."""
-    unit = ""
+def metric_column(metric: Metric, group: str) -> Column:
+    """Return the column of a metric."""
+    label = metric.name.replace("_", " ")
     if metric.unit != "1":
-        unit = metric.unit.replace("^2", "²")
+        label += f" [{metric.unit}]"
     return Column(
         key=metric.name,
-        label=words(metric.name),
-        unit=unit,
+        label=label,
+        group=group,
+        meaning=metric.summary,
+        read=lambda row: value_cell(row.metrics.get(metric.name)),
         direction=metric.direction,
         perfect=metric.perfect,
-        meaning=sentence(metric),
     )
 
 
-def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, ...]]:
-    """Return the keys of each preset that has something to show, main first, all
-    last.
-    """
-    metric_count = MAIN_METRICS
-    # main fits into 1280 pixels
-    if AGAINST_CLASSICAL.key in columns:
-        metric_count -= 1
-    if SKILL_ON_SHIFT.key in columns:
-        metric_count -= 1
-    main = (
-        "against_classical",
-        "skill_on_shift",
-        *tab.columns[:metric_count],
-        "kind",
-        "seconds_per_frame",
-        "cost_source",
-        "checked",
-    )
-    keys_by_name = {"main": main, **PRESETS, "all": tuple(columns)}
-    presets = {}
-    for name, keys in keys_by_name.items():
-        if columns.keys().isdisjoint(keys):
-            continue
-        shown_keys = {"skill", tab.ranking, *keys}
-        shown_columns = []
-        for key in columns:
-            if key in shown_keys:
-                shown_columns.append(key)
-        presets[name] = tuple(shown_columns)
-    return presets
+def columns_of(rows: Iterable[Row]) -> list[Column]:
+    """Return the columns of a table: those for which any row has something to show."""
+    rows = list(rows)
+    columns = list(MAIN_COLUMNS)
+    for group, names in METRIC_GROUPS.items():
+        for name in names:
+            if name in METRICS:
+                columns.append(metric_column(METRICS[name], group))
+    shown = []
+    for column in columns:
+        cells = [column.read(row) for row in rows]
+        if any(cell.text not in ("", NOTHING) for cell in cells):
+            shown.append(column)
+    return shown
 
 
-def value_of(row: TableRow, column: Column) -> float | str:
-    """Return the value of a row in a column; NaN or an empty text where it has none."""
-    value = metric_value(row, column.key)
-    if value is not None:
-        return value.mean
-    content = None
-    if column.read is not None:
-        content = column.read(row)
-    if column.form == "text":
-        return str(content or "")
-    if content is None:
-        return math.nan
-    return float(str(content))
-
-
-def loss_of(row: TableRow, column: Column) -> float:
-    """Return the loss of a row in a column, smaller is better; NaN where nothing is
-    judged.
-
-    Where the metric aims at a value, the loss is the mean over scenarios of their
-    distances from it: values below and above do not cancel.
-    """
-    value = value_of(row, column)
-    metric = metric_value(row, column.key)
-    if column.direction is Direction.TARGET and metric is not None:
-        losses = []
-        for scenario_mean in metric.per_scenario:
-            losses.append(column.loss(scenario_mean))
-        return mean(np.array(losses))
-    if isinstance(value, str):
-        return math.nan
-    return column.loss(value)
-
-
-def is_beside_dearer_solver(row: TableRow) -> bool:
-    """Tell whether a row is compared with a solver that costs more than the model."""
-    if isinstance(row, ReferenceRow) or row.against_classical is None:
-        return False
-    return row.solver_costs_more
-
-
-def metric_value(row: TableRow, key: str) -> Value | None:
-    """Return a metric, a skill or a ratio, with interval; None where a row has none."""
-    if row.on_shift is not None:
-        if key == SKILL_ON_SHIFT.key:
-            return row.on_shift.skill
-        if key == SCORE_ON_SHIFT.key:
-            return row.on_shift.score
-    if key == SKILL.key:
-        return row.skill
-    if isinstance(row, BoardRow) and key == AGAINST_CLASSICAL.key:
-        return row.against_classical
-    return row.values.get(key)
-
-
-def format_value(value: float | str, form: str) -> str:
-    """Return the text of a cell.
-
-    >>> format_value(0.012345, "number"), format_value(1612345.0, "count")
-    ('0.0123', '1.61 M')
-    >>> format_value(17.25, "factor")
-    '17.2×'
-    """
-    if isinstance(value, str):
-        return value or MISSING
-    if form == "count":
-        return _format_count(value)
-    if form == "factor" and math.isfinite(value):
-        return f"{text(value)}×"
-    return text(value)
-
-
-def _format_count(value: float) -> str:
-    """Return the text of a count: at most three digits, and a unit of counts."""
-    for factor, name in COUNT_UNITS:
-        if value >= 0.9995 * factor:
-            return f"{text(value / factor)} {name}"
-    return text(value)
-
-
-def leader_of(rows: Sequence[BoardRow]) -> BoardRow | None:
-    """Return the first ranked row; None where nothing is ranked."""
-    for row in rows:
-        if row.rank is not None:
-            return row
-    return None
+def best_of(column: Column, rows: Iterable[Row]) -> set[str]:
+    """Return the ids of the rows with the best value of a column."""
+    losses = {row.id: column.loss(column.read(row).order) for row in rows}
+    known = [loss for loss in losses.values() if not math.isnan(loss)]
+    if not known:
+        return set()
+    return {name for name, loss in losses.items() if loss == min(known)}

@@ -1,67 +1,133 @@
 """An entry of the leaderboard: one method on one split and size, as its YAML file.
 
 A submitter writes everything but the score block; ``lagbench submit`` alone writes the
-score block. Unknown keys are refused. Whether the maintainers scored the predictions
-again stands elsewhere: in verified.yaml.
+score block. Unknown keys are refused. Strangers write these files, so every text has a
+length, every number has a range, and links are http(s) and nothing else.
 """
 
 from __future__ import annotations
 
+import datetime
 import enum
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
 
-from lagbench.data.checksums import round_digits
+from lagbench.data.checksums import file_sha256, round_digits
+from lagbench.data.layout import major_of
+from lagbench.data.registry import Size
+from lagbench.data.yamlfile import format_yaml, read_yaml
+from lagbench.errors import ChecksFailedError, UsageError, escape_line
 from lagbench.references.predictor import Kind
 from lagbench.submission.budget import Budget, Track, track_of
 from lagbench.submission.format import Header
 from lagbench.submission.provenance import TrainingProvenance
 
-from .fields import (
-    MOST_BYTES,
-    MOST_SEEDS,
-    Command,
-    Date,
-    Hash,
-    InnerPath,
-    Label,
-    Line,
-    Link,
-    Long,
-    Name,
-    Number,
-    PlaceName,
-    Seconds,
-    Seed,
-    Short,
-    Version,
-)
-from .folder import Place, entry_path, score_paths, weights_path
+from .folder import Folder, Place, entry_path, score_paths
 
-OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
-
-LEAST_SCORE = 1e-38
-"""Size of a score, at least, to which a difference is relative: about the smallest
-normal number of float32.
-"""
+MOST_SEEDS = 20
+LONGEST_TEXT = 1000
 
 RELATIVE_TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in
 the last bits.
 """
 
+MOST_ISSUES = 10
+"""Mistakes of one file that a message lists."""
+
 BUDGET_COUNTS = ("windows", "steps", "start_steps")
 BUDGET_AMOUNTS = ("epochs", "cpu_hours", "validation_hours", "gpu_hours")
 BUDGET_LABELS = ("device", "threads", "metric")
 
 
-def relative_difference(submitted: float, reproduced: float) -> float:
-    """Return the difference of two scores, relative to the submitted one."""
-    return abs(reproduced - submitted) / max(abs(submitted), LEAST_SCORE)
+def _check_printable(text: str) -> str:
+    if not text.replace("\n", "").isprintable():
+        raise ValueError("holds characters that cannot be printed")
+    return text
+
+
+def _check_line(text: str) -> str:
+    if not text.isprintable() or text != text.strip():
+        raise ValueError("is no line of printable text")
+    return text
+
+
+def _check_inner_path(path: str) -> str:
+    if path.startswith("/") or "\\" in path or ".." in path.split("/"):
+        raise ValueError("is no path inside the leaderboard's folder")
+    return path
+
+
+def _parse_date(value: object) -> object:
+    if isinstance(value, str):
+        return datetime.date.fromisoformat(value)
+    return value
+
+
+def _check_date(date: datetime.date) -> datetime.date:
+    # somewhere on Earth it is tomorrow
+    if date > today() + datetime.timedelta(days=1):
+        raise ValueError("lies in the future")
+    return date
+
+
+def _check_kind(kind: Kind) -> Kind:
+    if kind is Kind.NAIVE:
+        raise ValueError("an entry is learned, hybrid, calibrated or classical")
+    return kind
+
+
+def today() -> datetime.date:
+    """Return the date of an entry or a record that is written now."""
+    return datetime.datetime.now(datetime.UTC).date()
+
+
+Name = Annotated[
+    str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$", max_length=60)
+]
+Label = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]+$", max_length=60)]
+Short = Annotated[
+    str, StringConstraints(min_length=1, max_length=100), AfterValidator(_check_line)
+]
+Line = Annotated[str, StringConstraints(max_length=200), AfterValidator(_check_line)]
+Long = Annotated[
+    str, StringConstraints(max_length=LONGEST_TEXT), AfterValidator(_check_printable)
+]
+# nothing that could end an HTML attribute
+Link = Annotated[
+    str,
+    StringConstraints(
+        pattern=r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$", max_length=300
+    ),
+]
+InnerPath = Annotated[
+    str,
+    StringConstraints(min_length=1, max_length=200),
+    AfterValidator(_check_line),
+    AfterValidator(_check_inner_path),
+]
+Hash = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Version = Annotated[str, StringConstraints(pattern=r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$")]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Date = Annotated[
+    datetime.date, BeforeValidator(_parse_date), AfterValidator(_check_date)
+]
 
 
 class Status(enum.StrEnum):
@@ -70,12 +136,6 @@ class Status(enum.StrEnum):
     ACTIVE = "active"
     SUPERSEDED = "superseded"
     WITHDRAWN = "withdrawn"
-
-
-def _check_kind(kind: Kind) -> Kind:
-    if kind is Kind.NAIVE:
-        raise ValueError("is not learned, hybrid, calibrated or classical")
-    return kind
 
 
 class Strict(BaseModel):
@@ -92,25 +152,13 @@ class DataSet(Strict):
 
 
 class Weights(Strict):
-    """The weights that made predictions, kept in the leaderboard's folder.
+    """The weights that made predictions, a file in the leaderboard's folder.
 
-    They lie beside the entry, or beside another one that keeps them. Two active entries
-    predict with the same weights in two ways.
+    Two entries may name the same file: at two sizes, or with other options.
     """
 
     path: InnerPath = Field(description="inside the leaderboard's folder")
     sha256: Hash = Field(description="of the file")
-    shared_with: PlaceName | None = Field(
-        default=None,
-        description="another entry that keeps the file, as in cavity/mini/gns",
-    )
-
-    def place_of(self, own: Place) -> Place:
-        """Return the place of the entry that keeps the file: another's, or its own."""
-        if self.shared_with is None:
-            return own
-        split, size, method = self.shared_with.split("/")
-        return split, size, method
 
 
 class Prediction(Strict):
@@ -121,11 +169,8 @@ class Prediction(Strict):
         description="content hash of the positions, as `lagbench score` prints it"
     )
     url: Link | None = None
-    path: InnerPath | None = Field(
-        default=None, description="inside the leaderboard's folder"
-    )
     bytes: int | None = Field(
-        default=None, gt=0, lt=MOST_BYTES, description="length of the file"
+        default=None, gt=0, lt=2**40, description="length of the file"
     )
     budget: Budget | None = Field(
         default=None, description="what its training took, as the file says"
@@ -135,6 +180,13 @@ class Prediction(Strict):
     )
     weights: Weights | None = None
 
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Options that the prediction changed."""
+        if self.provenance is None:
+            return ()
+        return self.provenance.prediction_overrides
+
 
 class EntryCost(Strict):
     """The cost of a predicted frame, and that of the solver on the same machine."""
@@ -143,14 +195,6 @@ class EntryCost(Strict):
     device: Short
     solver_seconds_per_frame: Seconds | None = None
 
-    @property
-    def speed_up(self) -> float | None:
-        """Solver time over model time; None without the former."""
-        solver_seconds = self.solver_seconds_per_frame
-        if solver_seconds is None:
-            return None
-        return solver_seconds / self.seconds_per_frame
-
 
 def mean_cost(
     headers: Sequence[Header], solver_seconds: float | None = None
@@ -158,27 +202,22 @@ def mean_cost(
     """Return the mean cost over files of predictions, as keys of an EntryCost.
 
     The solver's time is the one that is given, else the mean of those in the files [s].
-    Predictions may hold values that no entry may have, so the result is not checked.
     None unless all files name a time and the same machine.
     """
     device = headers[0].device
-    if not device:
-        return None
-
     model_times = []
     solver_times = []
     for header in headers:
-        if header.seconds_per_frame is None or header.device != device:
+        if header.seconds_per_frame is None or not device or header.device != device:
             return None
         model_times.append(header.seconds_per_frame)
         if header.solver_seconds_per_frame is not None:
             solver_times.append(header.solver_seconds_per_frame)
-
     if not solver_seconds and solver_times:
         solver_seconds = _rounded_mean(solver_times)
     return {
         "seconds_per_frame": _rounded_mean(model_times),
-        "device": device[:100],
+        "device": str(device)[:100],
         "solver_seconds_per_frame": solver_seconds,
     }
 
@@ -201,10 +240,7 @@ class EntryBudget(Budget):
 
         None unless each seed has a budget.
         """
-        budgets = []
-        for budget in seeds:
-            if budget is not None:
-                budgets.append(budget)
+        budgets = [budget for budget in seeds if budget is not None]
         if len(budgets) < len(seeds):
             return None
 
@@ -221,7 +257,6 @@ class EntryBudget(Budget):
             labels = {getattr(budget, name) for budget in budgets}
             if len(labels) == 1:
                 fields[name] = labels.pop()
-
         tracks = {track_of(size, budget) for budget in budgets}
         if len(tracks) == 1:
             fields["track"] = tracks.pop()
@@ -273,115 +308,6 @@ class ScoreBlock(Strict):
     metrics: Annotated[dict[str, Summary], Field(max_length=500)]
 
 
-class Level(enum.StrEnum):
-    """How far the maintainers followed the scores of an entry, lowest first."""
-
-    AS_SUBMITTED = "as submitted"
-    SCORED_AGAIN = "scored again"  # the submitter's predictions gave the same scores
-    REPRODUCED = "reproduced"  # its model, run by the maintainers, gave them
-
-    @property
-    def rank(self) -> int:
-        """0 for the lowest level."""
-        return list(Level).index(self)
-
-
-class Reproduction(Strict):
-    """The scores of one model of an entry, predicted anew by the maintainers."""
-
-    seed: Seed | None = None
-    model: Hash = Field(description="of the file of the model")
-    metric: Label = Field(description="the metric that ranks")
-    scenarios: Annotated[int, Field(ge=1)] = Field(description="predicted anew")
-    of: Annotated[int, Field(ge=1)] = Field(description="scenarios of the test subset")
-    submitted: Number = Field(description="mean over these scenarios, as submitted")
-    reproduced: Number = Field(description="mean over them, predicted anew")
-    difference: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
-        description="of the two, relative to the submitted one"
-    )
-    tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)]
-    greatest: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
-        default=0.0, description="greatest relative difference of one scenario"
-    )
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the scores are the same within the tolerance."""
-        return self.difference <= self.tolerance
-
-    @property
-    def has_stated_difference(self) -> bool:
-        """Whether the difference is that of both scores, up to the digits they have."""
-        difference = relative_difference(self.submitted, self.reproduced)
-        return math.isclose(difference, self.difference, rel_tol=0.1, abs_tol=1e-8)
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether all test scenarios were predicted anew."""
-        return self.scenarios == self.of
-
-
-class MeasuredCost(Strict):
-    """Processor time of a frame on one core, all rows measured in one run."""
-
-    machine: Short
-    date: Date
-    repeats: Annotated[int, Field(ge=1)] = Field(description="the least counts")
-    seconds_per_frame: Seconds = Field(description="of the model [s]")
-    solver: Seconds | None = Field(default=None, description="of our solver [s]")
-    classical: Annotated[dict[str, Seconds], Field(max_length=50)] = Field(
-        default_factory=dict, description="of the classical reference predictors [s]"
-    )
-    naive: Annotated[dict[str, Seconds], Field(max_length=50)] = Field(
-        default_factory=dict, description="of the naive reference predictors [s]"
-    )
-
-    @property
-    def speed_up(self) -> float | None:
-        """Solver time over model time; None without the former."""
-        if self.solver is None:
-            return None
-        return self.solver / self.seconds_per_frame
-
-    def is_of_same_run(self, other: MeasuredCost) -> bool:
-        """Return whether both were measured in one run, and so can be compared."""
-        own_time = {"seconds_per_frame": other.seconds_per_frame}
-        return self.model_copy(update=own_time) == other
-
-
-class Verification(Strict):
-    """A line of verified.yaml: what the maintainers found out about an entry."""
-
-    scores: Annotated[
-        tuple[Hash, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)
-    ]
-    lagbench: Short
-    date: Date
-    level: Annotated[Level, Field(strict=False)] = Level.SCORED_AGAIN
-    reproduced: Annotated[
-        tuple[Reproduction, ...], Field(max_length=MOST_SEEDS, strict=False)
-    ] = ()
-    cost: MeasuredCost | None = None
-
-    @property
-    def is_reproduced(self) -> bool:
-        """Whether the models were run again and gave the same scores."""
-        return self.level.rank >= Level.REPRODUCED.rank
-
-    @property
-    def is_reproduced_wholly(self) -> bool:
-        """Whether every model was run again on all test scenarios."""
-        is_complete = all(model.is_complete for model in self.reproduced)
-        return self.is_reproduced and is_complete
-
-    @model_validator(mode="after")
-    def _check_level(self) -> Self:
-        has_models = bool(self.reproduced)
-        if self.level.rank >= Level.REPRODUCED.rank and not has_models:
-            raise ValueError(f"level: {self.level} needs models that were predicted")
-        return self
-
-
 class About(Strict):
     """The description of a method by its submitter."""
 
@@ -396,8 +322,8 @@ class About(Strict):
     notes: Long = ""
     kind: Annotated[Kind, Field(strict=False), AfterValidator(_check_kind)] = Field(
         default=Kind.LEARNED,
-        description="learned: a network; hybrid: a solver with a network inside; "
-        "calibrated: a solver with up to a dozen fitted numbers; classical",
+        description="learned, hybrid (a solver with a network inside), calibrated (a "
+        "solver with fitted constants) or classical",
     )
     training: Long = Field(default="", description="what it was trained on, in words")
     budget: EntryBudget | None = None
@@ -405,7 +331,7 @@ class About(Strict):
         default=None, ge=0, lt=10**15, description="trainable parameters"
     )
     hardware: Line = Field(default="", description="machine of the training")
-    command: Command = Field(
+    command: Long = Field(
         default="", description="shell commands that make the predictions again"
     )
     cost: EntryCost | None = None
@@ -424,35 +350,6 @@ class Meta(About):
 class Entry(About):
     """The whole file leaderboard/submissions/<split>/<size>/<method>.yaml."""
 
-    KEY_ORDER: ClassVar[tuple[str, ...]] = (
-        "format",
-        "split",
-        "size",
-        "method",
-        "name",
-        "authors",
-        "affiliation",
-        "licence",
-        "code",
-        "paper",
-        "weights",
-        "date",
-        "notes",
-        "status",
-        "superseded_by",
-        "reason",
-        "kind",
-        "training",
-        "budget",
-        "parameters",
-        "hardware",
-        "command",
-        "dataset",
-        "predictions",
-        "cost",
-        "score",
-    )
-
     format: Literal[2]
     split: Name
     size: Name
@@ -462,7 +359,7 @@ class Entry(About):
         tuple[Short, ...], Field(min_length=1, max_length=50, strict=False)
     ]
     date: Date
-    command: Annotated[Command, Field(min_length=1)]
+    command: Annotated[Long, Field(min_length=1)]
     status: Annotated[Status, Field(strict=False)] = Status.ACTIVE
     superseded_by: Name | None = None
     reason: Long = Field(default="", description="why it was superseded or withdrawn")
@@ -477,20 +374,10 @@ class Entry(About):
         seeds = self.seeds
         if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
             raise ValueError("predictions: several need seeds that differ")
-
         predicted = [prediction.sha256 for prediction in self.predictions]
         scored = [file.predictions_sha256 for file in self.score.files]
         if predicted != scored:
-            raise ValueError(
-                "predictions: their hashes are not those of score.files, in the "
-                "same order"
-            )
-
-        is_superseded = self.status is Status.SUPERSEDED
-        if is_superseded != (self.superseded_by is not None):
-            raise ValueError(
-                "superseded_by: goes with status: superseded, and only with it"
-            )
+            raise ValueError("predictions: their hashes are not those of score.files")
         return self
 
     @property
@@ -514,37 +401,133 @@ class Entry(About):
         return score_paths(self.place, self.seeds)
 
     @property
-    def files(self) -> tuple[Path, ...]:
-        """Paths of all files beside the entry: scores, weights and training logs."""
-        paths = list(self.score_paths)
-        for prediction in self.predictions:
-            weights = prediction.weights
-            if weights is not None and weights.shared_with is None:
-                path = weights_path(self.place, prediction.seed, weights.path)
-                paths += [path, path.with_suffix(".json")]
-        return tuple(paths)
+    def has_models(self) -> bool:
+        """Whether a model of any seed lies on the board."""
+        return any(prediction.weights is not None for prediction in self.predictions)
 
-    @property
-    def shared_with(self) -> tuple[str, ...]:
-        """Other entries whose weights this one predicts with, as in cavity/mini/gns."""
-        keepers: dict[str, None] = {}
-        for prediction in self.predictions:
-            weights = prediction.weights
-            if weights is not None and weights.shared_with is not None:
-                keepers[weights.shared_with] = None
-        return tuple(keepers)
 
-    @property
-    def provenance(self) -> TrainingProvenance | None:
-        """Training behind the first seed; None where words of a person describe it."""
-        provenance = self.predictions[0].provenance
-        if provenance is None:
-            return TrainingProvenance.from_sentence(self.training)
-        return provenance
+KEY_ORDER = (
+    *("format", "split", "size", "method", "name", "authors", "affiliation"),
+    *("licence", "code", "paper", "weights", "date", "notes", "status"),
+    *("superseded_by", "reason", "kind", "training", "budget", "parameters"),
+    *("hardware", "command", "dataset", "predictions", "cost", "score"),
+)
+"""Order of the keys of an entry's file."""
 
-    def settings_of(self, prediction: Prediction) -> tuple[str, ...]:
-        """Return the options that one of the predictions changed, as it states them."""
-        provenance = prediction.provenance or self.provenance
-        if provenance is None:
-            return ()
-        return provenance.prediction_overrides
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validate(kind: type[Model], content: object, where: object) -> Model:
+    """Return the model that plain values describe.
+
+    Args:
+        kind: the model.
+        content: plain values, as a YAML file holds them.
+        where: the file, for the message.
+
+    Raises:
+        ChecksFailedError: a key is unknown or missing, or a value does not fit.
+    """
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        mistakes = []
+        for item in error.errors(include_url=False)[:MOST_ISSUES]:
+            key = ".".join(map(str, item["loc"])) or "the file"
+            mistakes.append(f"{escape_line(key)[:100]}: {item['msg']}")
+        raise ChecksFailedError(
+            f"{where} does not fit: {'; '.join(mistakes)}; docs/submitting.md "
+            "describes the keys"
+        ) from None
+
+
+def read_entry(path: Path) -> Entry:
+    """Read the entry of a YAML file.
+
+    Raises:
+        UnreadableFileError: the file cannot be read.
+        ChecksFailedError: it does not fit the schema.
+    """
+    return validate(Entry, read_yaml(path), path)
+
+
+def read_meta(path: Path | None, method: str | None = None) -> Meta:
+    """Return the description of a method from a YAML file; a method replaces its own.
+
+    Raises:
+        UsageError: the file does not fit `Meta`.
+        UnreadableFileError: no plain YAML.
+    """
+    content = {} if path is None else read_yaml(path)
+    if not isinstance(content, dict):
+        raise UsageError(f"{path} holds no lines of `key: value`; see submitting.md")
+    if method is not None:
+        content["method"] = method
+    try:
+        return validate(Meta, content, path or "--method")
+    except ChecksFailedError as error:
+        raise UsageError(error.what) from None
+
+
+def entry_bytes(entry: Entry) -> bytes:
+    """Return the bytes of an entry's YAML file; equal entries give equal bytes."""
+    values = entry.model_dump(mode="python", exclude_defaults=True)
+    return yaml_bytes({key: values[key] for key in KEY_ORDER if key in values})
+
+
+def yaml_bytes(value: object) -> bytes:
+    """Return plain values as the bytes of a YAML file."""
+    return format_yaml(_to_plain(value), default_flow_style=None).encode()
+
+
+def _to_plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _to_plain(member) for key, member in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_to_plain(member) for member in value]
+    if isinstance(value, enum.Enum):
+        return str(value)
+    return value
+
+
+def schema_bytes() -> bytes:
+    """Return the JSON schema of an entry as the bytes of leaderboard/schema.json."""
+    schema = Entry.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "Entry of the lagbench leaderboard"
+    return f"{json.dumps(schema, indent=1, ensure_ascii=False)}\n".encode()
+
+
+def find_model(folder: Folder, weights: Weights) -> Path:
+    """Return the file of a model, which must be the one that its entry names.
+
+    Raises:
+        ChecksFailedError: the file is another one, or missing.
+    """
+    path = folder.path / weights.path
+    if path.is_symlink() or not path.is_file():
+        raise ChecksFailedError(f"{path}: no such file; restore the weights")
+    sha256 = file_sha256(path)
+    if sha256 != weights.sha256:
+        raise ChecksFailedError(
+            f"{path} has SHA-256 {sha256[:16]}, its entry names {weights.sha256[:16]}; "
+            "restore the weights, or submit again"
+        )
+    return path
+
+
+def is_current(dataset: DataSet, size: Size) -> bool:
+    """Tell whether a data set is that of today.
+
+    It has the same MAJOR version, and the same hash where one is recorded.
+    """
+    if major_of(dataset.version) != size.major:
+        return False
+    return size.measured is None or dataset.sha256 == size.measured.dataset_sha256
+
+
+def data_set_of(identity: Mapping[str, str]) -> DataSet:
+    """Return the data set that a score file says its scores belong to."""
+    return DataSet.model_construct(
+        version=identity["dataset_version"], sha256=identity["dataset_sha256"]
+    )

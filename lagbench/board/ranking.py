@@ -1,4 +1,4 @@
-"""From score files to one score per method, reference predictors included.
+"""From score files to one score per method.
 
 The mean over seeds is taken per scenario (and per frame) first, over the seeds that
 have a value there; intervals and tests resample scenarios and seeds together.
@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.registry import Size
-from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import (
     Score,
     Tally,
@@ -25,19 +22,11 @@ from lagbench.metrics.aggregate import (
     mean_over_seeds,
 )
 from lagbench.metrics.table import METRICS
-from lagbench.references.shipped import ReferenceScores, shipped
-from lagbench.references.table import REFERENCES as KNOWN
 from lagbench.scoring.card import ScoreCard, digits
-from lagbench.scoring.scenario import SUBMISSION, Preview
-from lagbench.scoring.score_file_checks import read_score_file
-from lagbench.scoring.score_file_writer import write_statistics
 
-from .entry import OUTSIDE, DataSet, EntryFlag, ScoredFile, Summary
-from .fields import LONGEST_TEXT
-from .folder import REFERENCES, Folder
-from .selection import is_current
+from .entry import LONGEST_TEXT, EntryFlag, ScoredFile, Summary
 
-NO_PREDICTIONS = "0" * 64  # hash in score files of reference predictors
+OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,102 +112,6 @@ def summarise(scores: Mapping[str, CombinedScore]) -> dict[str, Summary]:
             high=digits(high),
         )
     return summaries
-
-
-def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
-    """Return the reference predictors of a split and size.
-
-    The package ships their scores on our splits. On other splits the scorer measures
-    them beside a submission, and :func:`write_references` keeps them in the folder:
-    they are equal whoever submits. Scores on another data set are left out, and so are
-    scores of a predictor that is no longer in the table.
-    """
-    shipped_scores = shipped(size)
-    if shipped_scores:
-        known_references = []
-        for reference in shipped_scores.values():
-            if reference.name in KNOWN:
-                known_references.append(reference)
-        return tuple(known_references)
-
-    references = []
-    for path in folder.reference_files(size.split, size.name):
-        file = folder.path / path
-        stored = read_score_file(file).scores
-        dataset = dataset_of(stored.identity)
-        if path.stem not in KNOWN or not is_current(dataset, size):
-            continue
-        read_score_file(file, size)  # refuses scores that do not fit the task
-        combined = combine([stored.tallies])
-        scores = {}
-        for name, combined_score in combined.items():
-            scores[name] = combined_score.score
-        references.append(
-            ReferenceScores(
-                name=path.stem,
-                scores=scores,
-                seconds_per_frame=math.nan,
-                correlation=np.empty(0),
-            )
-        )
-    return tuple(references)
-
-
-def dataset_of(identity: Mapping[str, str]) -> DataSet:
-    """Return the data set that scores say they belong to."""
-    return DataSet.model_construct(
-        version=identity["dataset_version"], sha256=identity["dataset_sha256"]
-    )
-
-
-def write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
-    """Write the reference predictors of a score card that the folder lacks.
-
-    Their pictures show the truth alone.
-
-    Returns:
-        Paths of the files that were written.
-    """
-    header = card.header
-    data_set_folder = folder.path / REFERENCES / header.split / header.size
-    preview = _truth_alone(card.preview)
-    written = []
-    for name in card.tallies.keys() - {SUBMISSION}:
-        path = data_set_folder / f"{name}.nc"
-        if _is_scored_on(path, header.dataset_sha256):
-            continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        reference_card = replace(
-            card,
-            header=replace(header, method=name),
-            predictions_sha256=NO_PREDICTIONS,
-            tallies={SUBMISSION: card.tallies[name]},
-            preview=preview,
-        )
-        write_statistics(reference_card, path, option="--board")
-        written.append(path)
-    return tuple(sorted(written))
-
-
-def _truth_alone(preview: Preview) -> Preview:
-    true_vorticity = preview.vorticity[0]
-    true_histogram = preview.histogram[0]
-    true_film = preview.film[0]
-    no_vorticity = np.full_like(true_vorticity, np.nan)
-    no_histogram = np.full_like(true_histogram, np.nan)
-    return replace(
-        preview,
-        vorticity=np.stack([true_vorticity, no_vorticity]),
-        histogram=np.stack([true_histogram, no_histogram]),
-        film=np.stack([true_film, true_film]),
-    )
-
-
-def _is_scored_on(path: Path, dataset_sha256: str) -> bool:
-    with suppress(UnreadableFileError):
-        identity = read_score_file(path).scores.identity
-        return identity["dataset_sha256"] == dataset_sha256
-    return False
 
 
 def scored_file(

@@ -1,9 +1,9 @@
-"""Reproduce entries: run their models again, and compare the scores.
+"""Reproduce entries: run their models again, compare the scores, measure the costs.
 
-``lagbench leaderboard reproduce`` predicts test scenarios with the model that lies
-beside an entry, scores the prediction, and compares it with the score file, scenario by
-scenario. Then it measures what a frame costs (`measured_cost`). Results go to
-verified.yaml after every model, so an interrupted run goes on where it stopped.
+``lagbench leaderboard reproduce`` predicts test scenarios with the model of an entry,
+scores the prediction, and compares it with the score file. Then it measures what a
+frame costs. Results go to verified.yaml after every model, so an interrupted run goes
+on where it stopped.
 
 The same model does not give the same bits on every processor. docs/reproduce.md says
 how far two processors differ; :data:`TOLERANCE` follows from that.
@@ -11,55 +11,72 @@ how far two processors differ; :data:`TOLERANCE` follows from that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+import itertools
+import os
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagbench.data.checksums import round_digits
 from lagbench.data.local import load_rooted_registry, resolve_root
-from lagbench.data.registry import Registry, Size
-from lagbench.errors import (
-    ChecksFailedError,
-    LagbenchError,
-    UsageError,
-    check_installed,
-)
-from lagbench.metrics.aggregate import Tally
-from lagbench.metrics.frame import snapshots
-from lagbench.metrics.table import select
-from lagbench.models.onnx_model import open_onnx
-from lagbench.scoring.scenario import SUBMISSION, measure_rows
+from lagbench.data.registry import Registry
+from lagbench.errors import ChecksFailedError, LagbenchError, WorkFailedError
+from lagbench.metrics.aggregate import Tally, score
+from lagbench.metrics.table import METRICS
+from lagbench.references.predictor import Kind, given_in
+from lagbench.references.table import references_of
 from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.task import ScoredTask, load_scored_task
+from lagbench.work.machine import available_cores, processor_name
 from lagbench.work.run import Meter, Progress
 
-from .entry import (
-    Entry,
+from .entry import Entry, Prediction, today
+from .folder import Folder
+from .models import (
+    Failure,
+    Runner,
+    choose_entries,
+    name_seed,
+    open_model,
+    predict_tallies,
+)
+from .verified import (
     Level,
     MeasuredCost,
-    Prediction,
     Reproduction,
     Verification,
+    empty_record,
+    read_verified,
+    record,
+    relative_difference,
+    verification_of,
 )
-from .entry_file import require_unchanged_model
-from .folder import Folder
-from .measured_cost import Runner, TimedEntry, TimeSolver, measure_costs
-from .scores_compared import compare, sample_scenarios
-from .selection import choose_entries, name_submit_command
-from .verified import read_verified, record, verification_of
 
+TOLERANCE = 1e-3
+"""Relative difference of the ranking metric, its mean over scenarios, up to which a
+score counts as reproduced.
+"""
 
-@dataclass(frozen=True, kw_only=True)
-class Failure:
-    """An entry that could not be run."""
+SCORE_DIGITS = 9
+DIFFERENCE_DIGITS = 2
+TIME_DIGITS = 4
 
-    # path of its YAML file in the leaderboard's folder; the data set (split/size) where
-    # the costs of all its entries failed
-    entry: str
-    error: LagbenchError
+REPEATS = 3
+"""Turns of every row whose time is measured."""
+
+TIMED_FRAMES = 10
+
+BUSY = 0.25
+"""Other running processes per core from which on costs are not recorded."""
+
+TimeSolver = Callable[[str, str], float | None]
+"""From a split and size to the solver's processor time of a frame [s]."""
 
 
 @dataclass(kw_only=True)
@@ -67,7 +84,7 @@ class ReproduceResult:
     """What came of running the models of entries again."""
 
     folder: Path
-    # lines of verified.yaml by path of the entry, those of earlier runs among them
+    # records by path of the entry, those of earlier runs among them
     lines: dict[str, Verification] = field(default_factory=dict)
     # predicted in this run, as in "cavity/mini/gns, seed 0"
     predicted: list[str] = field(default_factory=list)
@@ -89,16 +106,13 @@ class ReproduceResult:
         lines = {}
         for path, line in self.lines.items():
             lines[path] = line.model_dump(mode="json", exclude_none=True)
-        failures = {}
-        for failure in self.failures:
-            failures[failure.entry] = str(failure.error)
         return {
             "folder": str(self.folder),
             "entries": lines,
             "predicted": self.predicted,
             "measured": self.measured,
             "differing": self.differing,
-            "failures": failures,
+            "failures": {one.entry: str(one.error) for one in self.failures},
         }
 
     @property
@@ -130,11 +144,9 @@ def reproduce(
 ) -> ReproduceResult:
     """Run the models of entries, compare their scores, measure their costs.
 
-    Entries that are recorded for the same models and scores, with as many scenarios,
-    are not run again. Costs are compared inside a data set, so they are measured for
-    all its entries, unless all of them have costs of one run.
-
-    If no entry is named, an error of one entry is kept in the result, and the other
+    Models with a record of as many scenarios are not run again, and entries with a cost
+    are not timed again. Entries of one data set are timed together; no others are. If
+    no entry is named, an error of one entry is kept in the result, and the other
     entries are run.
 
     Args:
@@ -160,37 +172,33 @@ def reproduce(
         DataError: the data of a named entry are missing or others.
         ChecksFailedError: a model of a named entry is not the one that it names.
         UnreadableFileError: a model of a named entry cannot be read.
-        WorkFailedError: the disk or the memory is full.
+        WorkFailedError: the machine is too busy to record costs, or the disk or the
+            memory is full.
     """
     folder = Folder(board)
     folder.require()
     data_root = resolve_root(root)
-    rooted_registry = load_rooted_registry(data_root, registry)
-    chosen = choose_entries(folder, entries, rooted_registry, split=split, size=size)
-
-    run = _Reproduction(
+    run = _Run(
         folder=folder,
         root=data_root,
-        registry=rooted_registry,
+        registry=load_rooted_registry(data_root, registry),
         scenarios=scenarios,
         again=again,
         recording=recording,
         threads=threads,
         meter=Meter(progress),
         result=ReproduceResult(folder=folder.path),
+        raises=bool(entries),
     )
-    is_named = bool(entries)
+    chosen = choose_entries(folder, entries, run.registry, split=split, size=size)
     if scores:
         for entry in chosen:
             try:
                 run.reproduce(entry)
             except LagbenchError as error:
-                if is_named:
-                    raise
-                path = entry.yaml_path.as_posix()
-                run.result.failures.append(Failure(entry=path, error=error))
+                run.keep(entry, error)
     if costs:
-        run.measure_frame_costs(chosen, time_solver, is_named=is_named)
+        run.measure(chosen, time_solver)
     for entry in chosen:
         line = run.line_of(entry)
         if line is not None:
@@ -198,63 +206,8 @@ def reproduce(
     return run.result
 
 
-def open_model(
-    folder: Folder,
-    entry: Entry,
-    prediction: Prediction,
-    *,
-    root: Path,
-    registry: Registry,
-    threads: int = 1,
-) -> Runner:
-    """Return the model of a seed, ready to predict.
-
-    Raises:
-        UsageError: the seed has no model, or its architecture is not installed.
-        ChecksFailedError: the file is not the one that the entry names.
-        UnreadableFileError: the file is damaged.
-        DataError: it was trained on other data.
-    """
-    if prediction.weights is None:
-        raise UsageError(
-            "the seed has no model",
-            where=str(entry.yaml_path),
-            expected="a model of every seed beside the entry",
-            got="none",
-            fix="its submitter may add one: "
-            f"{name_submit_command(entry.yaml_path, folder.path)}",
-        )
-    path = require_unchanged_model(folder, prediction.weights)
-    if path.suffix == ".onnx":
-        return open_onnx(path, size=registry.size(entry.split, entry.size), root=root)
-
-    check_installed("torch", extra="baselines")
-    from lagbench.baselines.runner import WeightsRunner
-
-    return WeightsRunner(
-        path,
-        size=entry.size,
-        root=root,
-        registry=registry,
-        settings=entry.settings_of(prediction),
-        threads=threads,
-    )
-
-
-def score_positions(
-    task: ScoredTask, scenario: int, position: NDArray[np.float32], metric: str
-) -> Tally:
-    """Return the statistics of a predicted scenario that a metric needs."""
-    with task.opened(scenario) as truth:
-        rows = {SUBMISSION: snapshots(truth.scenario, position)}
-        tallies, _ = measure_rows(
-            truth.scenario, truth.snapshots(), rows, metrics=select([metric])
-        )
-    return tallies[SUBMISSION]
-
-
 @dataclass(kw_only=True)
-class _Reproduction:
+class _Run:
     """One run of the command: its choices, and what it has loaded."""
 
     folder: Folder
@@ -266,16 +219,41 @@ class _Reproduction:
     threads: int
     meter: Meter
     result: ReproduceResult
+    raises: bool  # whether errors of an entry end the run
     _tasks: dict[tuple[str, str], ScoredTask] = field(default_factory=dict)
-    # lines that are not written where the run records nothing
+    # records that are not written where the run records nothing
     _lines: dict[str, Verification] = field(default_factory=dict)
 
     def line_of(self, entry: Entry) -> Verification | None:
-        """Return the line of an entry: of this run, else the recorded one."""
+        """Return the record of an entry: of this run, else the written one."""
         line = self._lines.get(entry.yaml_path.as_posix())
         if line is None:
             line = verification_of(entry, read_verified(self.folder))
         return line
+
+    def keep(self, entry: Entry, error: LagbenchError) -> None:
+        """Keep the first error of an entry, or raise it."""
+        if self.raises:
+            raise error
+        name = "/".join(entry.place)
+        if name not in [failure.entry for failure in self.result.failures]:
+            self.result.failures.append(Failure(entry=name, error=error))
+
+    def _task(self, entry: Entry) -> ScoredTask:
+        key = (entry.split, entry.size)
+        if key not in self._tasks:
+            self._tasks[key] = load_scored_task(self.registry.size(*key), self.root)
+        return self._tasks[key]
+
+    def _change(
+        self, entry: Entry, change: Callable[[Verification], Verification]
+    ) -> None:
+        """Change the record of an entry; without recording only in memory."""
+        if self.recording:
+            record(self.folder, entry, change)
+        else:
+            line = self.line_of(entry) or empty_record(entry)
+            self._lines[entry.yaml_path.as_posix()] = change(line)
 
     def reproduce(self, entry: Entry) -> None:
         """Predict with every model of an entry, and record how the scores compare."""
@@ -286,39 +264,44 @@ class _Reproduction:
             chosen = sample_scenarios(
                 task.scenarios, prediction.weights.sha256, self.scenarios
             )
-            if not self.again and self._is_recorded(entry, prediction, len(chosen)):
-                continue
-            reproduction = self._predict(entry, index, task, chosen)
-            self._record(entry, reproduction)
-            self.result.predicted.append(name_seed(entry, prediction))
+            line = self.line_of(entry)
+            if line is not None and not self.again:
+                recorded = {one.seed: one.scenarios for one in line.reproduced}
+                if recorded.get(prediction.seed, 0) >= len(chosen):
+                    continue
+            name = name_seed(entry, prediction)
+            stored = read_score_file(self.folder.path / entry.score_paths[index])
+            model = self._open(entry, prediction)
+            self.meter.begin(name, total=len(chosen), scenarios=len(chosen))
+            try:
+                tallies = predict_tallies(
+                    model,
+                    task,
+                    entry.score.ranking_metric,
+                    chosen,
+                    done=lambda: self.meter.count(1, scenarios=1),
+                )
+            finally:
+                model.close()
+            reproduction = compare(
+                entry.score.ranking_metric,
+                {scenario: stored.scores.tallies[scenario] for scenario in chosen},
+                tallies,
+                seed=prediction.seed,
+                model=prediction.weights.sha256,
+                of=len(task.scenarios),
+            )
+            models = [one for one in entry.predictions if one.weights is not None]
+            self._change(
+                entry,
+                partial(
+                    with_reproduction, reproduction=reproduction, models=len(models)
+                ),
+            )
+            self.result.predicted.append(name)
 
-    def _is_recorded(self, entry: Entry, prediction: Prediction, count: int) -> bool:
-        line = self.line_of(entry)
-        if line is None:
-            return False
-        for one in line.reproduced:
-            if one.seed == prediction.seed and one.scenarios >= count:
-                return True
-        return False
-
-    def _task(self, entry: Entry) -> ScoredTask:
-        size = self._size(entry)
-        key = (entry.split, entry.size)
-        if key not in self._tasks:
-            self._tasks[key] = load_scored_task(size, self.root)
-        return self._tasks[key]
-
-    def _size(self, entry: Entry) -> Size:
-        return self.registry.size(entry.split, entry.size)
-
-    def _predict(
-        self, entry: Entry, index: int, task: ScoredTask, chosen: Sequence[int]
-    ) -> Reproduction:
-        """Predict scenarios with a model and compare the ranking metric."""
-        prediction = entry.predictions[index]
-        metric = entry.score.ranking_metric
-        stored = read_score_file(self.folder.path / entry.score_paths[index])
-        model = open_model(
+    def _open(self, entry: Entry, prediction: Prediction) -> Runner:
+        return open_model(
             self.folder,
             entry,
             prediction,
@@ -326,193 +309,204 @@ class _Reproduction:
             registry=self.registry,
             threads=self.threads,
         )
-        self.meter.begin(
-            name_seed(entry, prediction), total=len(chosen), scenarios=len(chosen)
-        )
-        tallies = {}
-        stored_tallies = {}
-        try:
-            for scenario in chosen:
-                position = model.predict(task.truth.path(scenario))
-                tallies[scenario] = score_positions(task, scenario, position, metric)
-                stored_tallies[scenario] = stored.scores.tallies[scenario]
-                self.meter.count(1, scenarios=1)
-        finally:
-            model.close()
-        return compare(
-            metric,
-            stored_tallies,
-            tallies,
-            seed=prediction.seed,
-            model=str(prediction.weights and prediction.weights.sha256),
-            of=len(task.scenarios),
-        )
 
-    def _record(self, entry: Entry, reproduction: Reproduction) -> None:
-        def change(line: Verification) -> Verification:
-            return with_reproduction(line, reproduction, seeds=len(entry.predictions))
-
-        self._change_line(entry, change)
-
-    def _change_line(
-        self, entry: Entry, change: Callable[[Verification], Verification]
-    ) -> None:
-        """Change the verification of an entry: in verified.yaml, or without recording
-        only in memory.
-        """
-        if self.recording:
-            record(self.folder, entry, change)
-            return
-        line = self.line_of(entry)
-        if line is None:
-            line = Verification.model_construct(
-                scores=(), level=Level.AS_SUBMITTED, reproduced=(), cost=None
-            )
-        self._lines[entry.yaml_path.as_posix()] = change(line)
-
-    def measure_frame_costs(
-        self,
-        entries: Sequence[Entry],
-        time_solver: TimeSolver | None,
-        *,
-        is_named: bool,
-    ) -> None:
-        """Measure what a frame costs each model on the data sets of some entries.
-
-        Costs compare within one run only. So all active entries of such a data set are
-        timed, not the given ones alone, unless all have costs of one run already.
-        """
-        by_data_set: dict[tuple[str, str], list[Entry]] = {}
-        for entry in entries:
-            by_data_set.setdefault((entry.split, entry.size), []).append(entry)
-        for (split, size), named in by_data_set.items():
-            group = choose_entries(
-                self.folder, (), self.registry, split=split, size=size
-            )
-            for entry in named:
-                if entry not in group:
-                    group.append(entry)
-            if not self.again and self._have_costs_of_one_run(group):
-                continue
-            try:
-                self._measure_costs_of_data_set(group, time_solver)
-            except LagbenchError as error:
-                if is_named:
-                    raise
-                failure = Failure(entry=f"{split}/{size}", error=error)
-                self.result.failures.append(failure)
-
-    def _have_costs_of_one_run(self, entries: Sequence[Entry]) -> bool:
-        costs = []
+    def measure(self, entries: Sequence[Entry], time_solver: TimeSolver | None) -> None:
+        """Measure what a frame costs the models of entries, by data set."""
+        groups: dict[tuple[str, str], list[Entry]] = {}
         for entry in entries:
             line = self.line_of(entry)
-            if line is None or line.cost is None:
-                return False
-            costs.append(line.cost)
-        return all(cost.is_of_same_run(costs[0]) for cost in costs)
-
-    def _measure_costs_of_data_set(
-        self, entries: Sequence[Entry], time_solver: TimeSolver | None
-    ) -> None:
-        """Time the models of entries of one data set in one run, and keep the costs.
-
-        The first model of an entry that opens is timed. An entry without such a model,
-        or whose model fails, gets no cost; the result has its error. Costs go to
-        verified.yaml, or stay in memory if nothing is recorded.
-        """
-        timed = []
-        opened: list[Runner] = []
-        try:
-            for entry in entries:
-                runner = self._open_a_model(entry)
-                if runner is not None:
-                    opened.append(runner)
-                    timed.append(TimedEntry(entry=entry, runner=runner))
-            if not timed:
-                return
-            task = self._task(entries[0])
-            costs = measure_costs(
-                timed,
-                task,
-                root=self.root,
-                time_solver=time_solver,
-                meter=self.meter,
-                keep_failure=self._keep_failure,
-            )
-        finally:
-            for runner in opened:
-                runner.close()
-        measured = {}
-        for entry, cost in costs:
-            measured[entry.yaml_path] = cost
-        for entry in entries:
-            new_cost = measured.get(entry.yaml_path)
-            if new_cost is not None:
-                self.result.measured.append("/".join(entry.place))
-            elif self.line_of(entry) is None:
-                continue
-            # a cost of an earlier run does not compare with those of this one
-            self._change_line(entry, partial(_with_cost, cost=new_cost))
-
-    def _open_a_model(self, entry: Entry) -> Runner | None:
-        """Return the first model of an entry that can be opened, None without one.
-
-        The first error is kept in the result.
-        """
-        for prediction in entry.predictions:
-            if prediction.weights is None:
-                continue
-            try:
-                return open_model(
-                    self.folder,
-                    entry,
-                    prediction,
-                    root=self.root,
-                    registry=self.registry,
-                )
-            except LagbenchError as error:
-                self._keep_failure(entry, error)
-        return None
-
-    def _keep_failure(self, entry: Entry, error: LagbenchError) -> None:
-        """Keep the first error of an entry in the result."""
-        path = entry.yaml_path.as_posix()
-        failed = {failure.entry for failure in self.result.failures}
-        if path not in failed:
-            self.result.failures.append(Failure(entry=path, error=error))
+            if self.again or line is None or line.cost is None:
+                groups.setdefault((entry.split, entry.size), []).append(entry)
+        for group in groups.values():
+            if self.recording:
+                require_idle_machine()
+            with ExitStack() as opened:
+                runners = {}
+                for entry in group:
+                    first = next(one for one in entry.predictions if one.weights)
+                    try:
+                        runner = self._open(entry, first)
+                    except LagbenchError as error:
+                        self.keep(entry, error)
+                        continue
+                    opened.callback(runner.close)
+                    runners[entry.method] = runner
+                if not runners:
+                    continue
+                try:
+                    costs = measure_costs(
+                        runners,
+                        self._task(group[0]),
+                        root=self.root,
+                        time_solver=time_solver,
+                        meter=self.meter,
+                    )
+                except LagbenchError as error:
+                    self.keep(group[0], error)
+                    continue
+            for entry in group:
+                cost = costs.get(entry.method)
+                if cost is not None:
+                    self._change(entry, partial(_with_cost, cost=cost))
+                    self.result.measured.append("/".join(entry.place))
 
 
-def _with_cost(line: Verification, cost: MeasuredCost | None) -> Verification:
+def _with_cost(line: Verification, cost: MeasuredCost) -> Verification:
     return line.model_copy(update={"cost": cost})
 
 
+def sample_scenarios(
+    scenarios: Collection[int], model_sha256: str, count: int | None
+) -> tuple[int, ...]:
+    """Return the scenarios to predict anew, ascending.
+
+    A sample follows from the model, so it is the same in every run.
+    """
+    if count is None or count >= len(scenarios):
+        return tuple(sorted(scenarios))
+
+    def digest(scenario: int) -> bytes:
+        return hashlib.sha256(f"{model_sha256} {scenario}".encode()).digest()
+
+    return tuple(sorted(sorted(scenarios, key=digest)[:count]))
+
+
+def compare(
+    metric: str,
+    submitted: Mapping[int, Tally],
+    reproduced: Mapping[int, Tally],
+    *,
+    seed: int | None,
+    model: str,
+    of: int,
+) -> Reproduction:
+    """Return how a metric of the same scenarios compares.
+
+    Raises:
+        ChecksFailedError: one side has no value.
+    """
+    before = score(METRICS[metric], submitted)
+    after = score(METRICS[metric], reproduced)
+    if before is None or after is None:
+        raise ChecksFailedError(f"{metric} has no value in some scenario")
+    differences = []
+    for submitted_value, value in zip(before.values, after.values, strict=True):
+        differences.append(relative_difference(submitted_value, value))
+    difference = relative_difference(before.mean, after.mean)
+    return Reproduction(
+        seed=seed,
+        model=model,
+        metric=metric,
+        scenarios=len(reproduced),
+        of=of,
+        submitted=round_digits(before.mean, SCORE_DIGITS),
+        reproduced=round_digits(after.mean, SCORE_DIGITS),
+        difference=round_digits(difference, DIFFERENCE_DIGITS),
+        tolerance=TOLERANCE,
+        greatest=round_digits(float(np.max(differences)), DIFFERENCE_DIGITS),
+    )
+
+
 def with_reproduction(
-    line: Verification, reproduction: Reproduction, *, seeds: int
+    line: Verification, reproduction: Reproduction, *, models: int
 ) -> Verification:
-    """Return a line with one more reproduction, at the level that follows.
+    """Return a record with one more reproduction, at the level that follows.
 
     Args:
-        line: the line of an entry.
+        line: the record of an entry.
         reproduction: the result of one of its models.
-        seeds: number of predictions of the entry.
+        models: number of models of the entry.
     """
-    others = []
-    for one in line.reproduced:
-        if one.seed != reproduction.seed:
-            others.append(one)
+    others = [one for one in line.reproduced if one.seed != reproduction.seed]
     reproduced = sorted([*others, reproduction], key=lambda one: one.seed or 0)
-    is_reproduced = len(reproduced) == seeds and all(one.agrees for one in reproduced)
     level = line.level
-    if is_reproduced and level.rank < Level.REPRODUCED.rank:
+    if len(reproduced) == models and all(one.agrees for one in reproduced):
         level = Level.REPRODUCED
-    elif not is_reproduced and level.rank >= Level.REPRODUCED.rank:
+    elif level is Level.REPRODUCED:
         level = Level.AS_SUBMITTED
     return line.model_copy(update={"reproduced": tuple(reproduced), "level": level})
 
 
-def name_seed(entry: Entry, prediction: Prediction) -> str:
-    """Return the name of one seed of an entry, as in ``cavity/mini/gns, seed 0``."""
-    name = "/".join(entry.place)
-    if prediction.seed is None:
-        return name
-    return f"{name}, seed {prediction.seed}"
+def require_idle_machine() -> None:
+    """Refuse to record costs beside other work, which makes them longer.
+
+    Raises:
+        WorkFailedError: other processes run.
+    """
+    others = os.getloadavg()[0] - 1.0  # this process was at work until now
+    if others > BUSY * available_cores():
+        raise WorkFailedError(
+            f"the machine is busy (load {others:.1f} beside this process), so costs "
+            "would be wrong; wait, or leave them out: --no-costs"
+        )
+
+
+def measure_costs(
+    runners: Mapping[str, Runner],
+    task: ScoredTask,
+    *,
+    root: Path,
+    time_solver: TimeSolver | None,
+    meter: Meter,
+) -> dict[str, MeasuredCost]:
+    """Return the cost of a frame by method: models of one data set in one run.
+
+    Every row takes its turn in every repeat, on one core, and the least of the repeats
+    counts: other work on the machine can only add. The times are processor times.
+
+    Args:
+        runners: models of one split and size, by method.
+        task: the test subset of that data set; its first scenario is predicted.
+        root: folder of all data sets.
+        time_solver: function that returns the solver's time, None where the solver
+            cannot run; None leaves it out.
+        meter: counts the rows that are timed.
+    """
+    size = task.size
+    first_scenario = task.scenarios[0]
+    path = task.truth.path(first_scenario)
+    with task.opened(first_scenario) as truth:
+        given = given_in(truth.file, size, root)
+    # those that read train take minutes, and lie in files of the package already
+    references = [one for one in references_of(size) if not one.reads_train]
+    frames = min(TIMED_FRAMES, task.config.horizon)
+
+    times: dict[tuple[str, str], list[float]] = {}
+    row_count = len(runners) + len(references) + 1
+    meter.begin(
+        f"costs of {size.split} {size.name}", total=row_count * REPEATS, scenarios=0
+    )
+    for _ in range(REPEATS):
+        if time_solver is not None:
+            seconds = time_solver(size.split, size.name)
+            if seconds is not None:
+                times.setdefault(("solver", ""), []).append(seconds)
+        meter.count(1)
+        for reference in references:
+            started = time.process_time()
+            count = len(list(itertools.islice(reference.predict(given), frames)))
+            seconds = (time.process_time() - started) / count
+            times.setdefault((reference.kind, reference.name), []).append(seconds)
+            meter.count(1)
+        for method, runner in runners.items():
+            seconds = runner.time(path, frames)
+            times.setdefault(("model", method), []).append(seconds)
+            meter.count(1)
+
+    least: dict[str, dict[str, float]] = {}
+    for (kind, name), seconds_of_turns in times.items():
+        seconds = max(round_digits(min(seconds_of_turns), TIME_DIGITS), 1e-7)
+        least.setdefault(kind, {})[name] = seconds
+    classical = {**least.get(Kind.CLASSICAL, {}), **least.get(Kind.CALIBRATED, {})}
+    costs = {}
+    for method, seconds in least["model"].items():
+        costs[method] = MeasuredCost(
+            machine=f"{processor_name()}, 1 thread",
+            date=today(),
+            repeats=REPEATS,
+            seconds_per_frame=seconds,
+            solver=least.get("solver", {}).get(""),
+            classical=classical,
+            naive=least.get(Kind.NAIVE, {}),
+        )
+    return costs

@@ -1,13 +1,13 @@
-"""Scores on the subset ``shift``, leaderboard/shift.yaml.
+"""Scores of entries on the subset ``shift``, leaderboard/shift.yaml.
 
-``shift`` lies outside train on purpose. ``lagbench leaderboard shift`` predicts it with
-the models of entries and writes the ranking metric of every scenario. A line holds
-while the entry has the very models that the line names and the data are the same.
+``shift`` lies outside train on purpose. ``lagbench leaderboard shift`` writes the
+ranking metric of every scenario. A line holds while the entry has the very models that
+the line names and the data are the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 import numpy as np
@@ -15,22 +15,17 @@ from pydantic import Field, RootModel
 
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import ChecksFailedError, LagbenchError
+from lagbench.data.yamlfile import read_yaml
+from lagbench.errors import LagbenchError
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.table import METRICS
-from lagbench.submission.issues import ValidationIssue
 
-from .entry import Entry, Strict
-from .entry_file import examine, format_issues, load_plain, yaml_bytes
-from .fields import Hash, Label, RankingValue, Seed
-from .folder import SHIFT, Folder, Place, entry_path
-from .issues import issue_from_error, make_issue
-from .lock import board_lock
+from .entry import Entry, Hash, Label, Seed, Strict, validate, yaml_bytes
+from .folder import SHIFT, Folder
 
 SUBSET = "shift"
 
-MOST_SHIFT_BYTES = 4_000_000
-"""Longest file [bytes]; a model takes about 500."""
+RankingValue = Annotated[float, Field(ge=0.0, le=1e75, allow_inf_nan=False)]
 
 
 class ShiftModel(Strict):
@@ -56,7 +51,7 @@ class ShiftFile(RootModel[dict[str, ShiftScores]]):
     """Entries by path, relative to the leaderboard's folder."""
 
 
-def read_shift(folder: Folder) -> Mapping[str, ShiftScores]:
+def read_shift(folder: Folder) -> dict[str, ShiftScores]:
     """Return the scores on ``shift`` by path of the entry; empty without the file.
 
     Raises:
@@ -64,60 +59,41 @@ def read_shift(folder: Folder) -> Mapping[str, ShiftScores]:
         ChecksFailedError: it holds something else.
     """
     path = folder.path / SHIFT
-    if not path.exists() and not path.is_symlink():
+    if not path.exists():
         return {}
-    content = load_plain(path, longest=MOST_SHIFT_BYTES)
-    if content is None:
-        content = {}
-    shift, issues = examine(ShiftFile, content)
-    if shift is None:
-        raise ChecksFailedError(
-            "the scores on shift do not fit",
-            where=str(path),
-            expected="what `lagbench leaderboard shift` writes",
-            got=format_issues(issues),
-            fix="restore the file, or write it anew: lagbench leaderboard shift",
-        )
-    return shift.root
+    return validate(ShiftFile, read_yaml(path) or {}, path).root
 
 
 def shift_of(
     entry: Entry, size: Size, shift: Mapping[str, ShiftScores]
 ) -> ShiftScores | None:
-    """Return the scores of an entry on ``shift``.
-
-    None without any, and where they belong to other data or models.
-    """
+    """Return the scores of an entry; None without any, or of other data or models."""
     scores = shift.get(entry.yaml_path.as_posix())
-    if scores is None or find_mismatch(entry, size, scores) is not None:
+    if scores is None or scores.metric != entry.score.ranking_metric:
+        return None
+    if size.measured is not None:
+        recorded = (
+            size.measured.dataset_sha256,
+            size.measured.subset_sha256.get(SUBSET),
+        )
+        if (scores.dataset_sha256, scores.subset_sha256) != recorded:
+            return None
+    if not _models_of(entry).issuperset(_models_in(scores)):
         return None
     return scores
 
 
-def find_mismatch(entry: Entry, size: Size, scores: ShiftScores) -> str | None:
-    """Return what of the scores does not belong to an entry, None where all does."""
-    if scores.metric != entry.score.ranking_metric:
-        return f"metric {scores.metric}"
-    if size.measured is not None:
-        subset_sha256 = size.measured.subset_sha256.get(SUBSET)
-        is_current = scores.dataset_sha256 == size.measured.dataset_sha256
-        if not is_current or scores.subset_sha256 != subset_sha256:
-            return "scores of other data"
-    hashes = {}  # of the entry's models, by seed
+def _models_of(entry: Entry) -> set[tuple[int | None, str]]:
+    """Return seed and hash of the models of an entry."""
+    models = set()
     for prediction in entry.predictions:
         if prediction.weights is not None:
-            hashes[prediction.seed] = prediction.weights.sha256
-    seeds = set()
-    scenarios = sorted(size.subsets.get(SUBSET, ()))
-    for model in scores.models:
-        if hashes.get(model.seed) != model.model:
-            return f"a model with SHA-256 {model.model[:16]}"
-        if model.seed in seeds:
-            return f"seed {model.seed} twice"
-        if sorted(model.values) != scenarios:
-            return f"seed {model.seed}: other scenarios"
-        seeds.add(model.seed)
-    return None
+            models.add((prediction.seed, prediction.weights.sha256))
+    return models
+
+
+def _models_in(scores: ShiftScores) -> set[tuple[int | None, str]]:
+    return {(model.seed, model.model) for model in scores.models}
 
 
 def scores_of_seeds(scores: ShiftScores) -> list[Score]:
@@ -126,110 +102,67 @@ def scores_of_seeds(scores: ShiftScores) -> list[Score]:
     for model in scores.models:
         scenarios = tuple(sorted(model.values))
         values = [model.values[scenario] for scenario in scenarios]
-        score = Score(
-            metric=METRICS[scores.metric],
-            scenarios=scenarios,
-            frames=(),
-            per_frame=np.empty((len(scenarios), 0)),
-            values=np.array(values),
-            undefined=(0,) * len(scenarios),
+        seeds.append(
+            Score(
+                metric=METRICS[scores.metric],
+                scenarios=scenarios,
+                frames=(),
+                per_frame=np.empty((len(scenarios), 0)),
+                values=np.array(values),
+                undefined=(0,) * len(scenarios),
+            )
         )
-        seeds.append(score)
     return seeds
 
 
 def record_shift(
-    folder: Folder,
-    entry: Entry,
-    size: Size,
-    written: ShiftModel,
-    *,
-    subset_sha256: str,
+    folder: Folder, entry: Entry, size: Size, written: ShiftModel, subset_sha256: str
 ) -> None:
-    """Write the scores of one model; those of earlier models and data are let go.
-
-    The file is read again under the lock, so that a record of somebody else stays.
-
-    Args:
-        folder: the leaderboard's folder.
-        entry: the entry that has the model.
-        size: the data set.
-        written: the scores of the model.
-        subset_sha256: hash of the files of ``shift``.
-    """
-    name = entry.yaml_path.as_posix()
-    with board_lock(folder):
-        shift = dict(read_shift(folder))
+    """Write the scores of one model; those of earlier models and data are let go."""
+    with folder.lock():
+        shift = read_shift(folder)
         present = shift_of(entry, size, shift)
         models = [written]
         if present is not None:
-            for one in present.models:
-                if one.seed != written.seed:
-                    models.append(one)
+            models += [one for one in present.models if one.seed != written.seed]
         models.sort(key=lambda one: one.seed or 0)
-        shift[name] = ShiftScores(
+        shift[entry.yaml_path.as_posix()] = ShiftScores(
             metric=entry.score.ranking_metric,
             dataset_sha256=entry.dataset.sha256,
             subset_sha256=subset_sha256,
             models=tuple(models),
         )
-        data = _file_bytes(shift)
-        write_atomically(folder.path / SHIFT, data, option="--board")
+        _write(folder, shift)
 
 
-def shift_without_stale_line(folder: Folder, entry: Entry) -> bytes | None:
-    """Return shift.yaml without an entry's line for other models.
-
-    None where the file has no such line.
-    """
-    shift = dict(read_shift(folder))
-    name = entry.yaml_path.as_posix()
-    scores = shift.get(name)
-    if scores is None:
-        return None
-    models = set()
-    for prediction in entry.predictions:
-        if prediction.weights is not None:
-            models.add((prediction.seed, prediction.weights.sha256))
-    if all((one.seed, one.model) in models for one in scores.models):
-        return None
-    del shift[name]
-    return _file_bytes(shift)
+def remove_stale_scores(folder: Folder, entry: Entry) -> bool:
+    """Remove the scores of other models of an entry; return whether there were."""
+    shift = read_shift(folder)
+    scores = shift.get(entry.yaml_path.as_posix())
+    if scores is None or _models_of(entry).issuperset(_models_in(scores)):
+        return False
+    del shift[entry.yaml_path.as_posix()]
+    _write(folder, shift)
+    return True
 
 
 def check_shift(
-    folder: Folder,
-    entries: Sequence[Entry],
-    registry: Registry,
-    *,
-    unreadable_places: Set[Place] = frozenset(),
-) -> Iterator[ValidationIssue]:
-    """Yield lines that belong to no entry, or to other models, data or scenarios.
-
-    Lines of entries that cannot be read are passed over.
-    """
+    folder: Folder, entries: Mapping[str, Entry], registry: Registry
+) -> Iterator[str]:
+    """Yield lines that belong to no entry, or to other models or data."""
     try:
         shift = read_shift(folder)
     except LagbenchError as error:
-        yield issue_from_error("shift", error, SHIFT)
+        yield str(error)
         return
-    by_path = {entry.yaml_path.as_posix(): entry for entry in entries}
-    unreadable_names = {entry_path(place).as_posix() for place in unreadable_places}
-    for name, scores in shift.items():
-        if name in unreadable_names:
-            continue
-        where = f"{SHIFT}, {ascii(name)[1:-1][:120]}"
-        entry = by_path.get(name)
+    for name in shift:
+        entry = entries.get(name)
         if entry is None:
-            yield make_issue("shift", where, "no such entry")
-            continue
-        mismatch = find_mismatch(entry, registry.size(entry.split, entry.size), scores)
-        if mismatch is not None:
-            yield make_issue("shift", where, mismatch)
+            yield f"{SHIFT}, {name}: no such entry; remove the line"
+        elif shift_of(entry, registry.size(entry.split, entry.size), shift) is None:
+            yield f"{SHIFT}, {name}: scores of other models or data; remove the line"
 
 
-def _file_bytes(shift: Mapping[str, ShiftScores]) -> bytes:
-    lines = {}
-    for name, scores in sorted(shift.items()):
-        lines[name] = scores.model_dump()
-    return yaml_bytes(lines)
+def _write(folder: Folder, shift: Mapping[str, ShiftScores]) -> None:
+    lines = {name: scores.model_dump() for name, scores in sorted(shift.items())}
+    write_atomically(folder.path / SHIFT, yaml_bytes(lines), option="--board")

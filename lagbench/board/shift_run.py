@@ -1,7 +1,7 @@
 """Score entries on ``shift``: predict it with their models (``leaderboard shift``).
 
 Results go to shift.yaml after every model, so an interrupted run goes on where it
-stopped. The task is that of ``test``; only the scenarios lie outside train.
+stopped.
 """
 
 from __future__ import annotations
@@ -15,26 +15,19 @@ import numpy as np
 from lagbench.data.checksums import round_digits
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.manifest import read_manifest
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.task import ScoredTask, load_scored_task
+from lagbench.scoring.task import load_scored_task
 from lagbench.work.run import Meter, Progress
 
-from .entry import Entry, Prediction
 from .folder import Folder
-from .reproduce import Failure, name_seed, open_model, score_positions
-from .scores_compared import DIGITS
-from .selection import choose_entries
-from .shift import (
-    SUBSET,
-    ShiftModel,
-    ShiftScores,
-    read_shift,
-    record_shift,
-    shift_of,
-)
+from .models import Failure, choose_entries, name_seed, open_model, predict_tallies
+from .shift import SUBSET, ShiftModel, ShiftScores, read_shift, record_shift, shift_of
+
+DIGITS = 9
+"""Digits of a score in the file."""
 
 
 @dataclass(kw_only=True)
@@ -53,14 +46,11 @@ class ShiftResult:
         entries = {}
         for path, scores in self.entries.items():
             entries[path] = scores.model_dump(mode="json")
-        failures = {}
-        for failure in self.failures:
-            failures[failure.entry] = str(failure.error)
         return {
             "folder": str(self.folder),
             "entries": entries,
             "predicted": self.predicted,
-            "failures": failures,
+            "failures": {one.entry: str(one.error) for one in self.failures},
         }
 
     @property
@@ -99,161 +89,84 @@ def score_on_shift(
     Raises:
         UsageError: there is no leaderboard, no such entry, one without a model, or
             nothing to run.
-        DataError: the data of a named entry are missing or others.
-        ChecksFailedError: a model of a named entry is not the one that it names, or
-            its ranking metric has no value.
-        UnreadableFileError: a model of a named entry cannot be read.
-        WorkFailedError: the disk or the memory is full.
+        LagbenchError: a named entry cannot be run; of all entries the others are run.
     """
     folder = Folder(board)
     folder.require()
     data_root = resolve_root(root)
-    rooted_registry = load_rooted_registry(data_root, registry)
-    run = _ShiftRun(
-        folder=folder,
-        root=data_root,
-        registry=rooted_registry,
-        again=again,
-        threads=threads,
-        meter=Meter(progress),
-        result=ShiftResult(folder=folder.path),
-    )
-    chosen = choose_entries(folder, entries, rooted_registry, split=split, size=size)
+    rooted = load_rooted_registry(data_root, registry)
+    meter = Meter(progress)
+    result = ShiftResult(folder=folder.path)
+    chosen = choose_entries(folder, entries, rooted, split=split, size=size)
     if not entries:
-        chosen = [entry for entry in chosen if _has_shift(entry, rooted_registry)]
-        _require_some(chosen, folder, split, size)
+        chosen = [
+            entry
+            for entry in chosen
+            if SUBSET in rooted.size(entry.split, entry.size).subsets
+        ]
+    if not chosen:
+        raise UsageError("no entry to score on shift; `lagbench list` shows subsets")
 
     for entry in chosen:
         path = entry.yaml_path.as_posix()
+        tier = rooted.size(entry.split, entry.size)
         try:
-            run.score(entry)
+            for prediction in entry.predictions:
+                if prediction.weights is None:
+                    continue
+                present = shift_of(entry, tier, read_shift(folder))
+                seeds = () if present is None else [one.seed for one in present.models]
+                if prediction.seed in seeds and not again:
+                    continue
+                manifest = read_manifest(data_root, tier.split, tier.name, tier.major)
+                if manifest is None or SUBSET not in manifest.subset_sha256:
+                    raise DataError(
+                        f"no manifest with the hash of {SUBSET}; lagbench verify "
+                        f"--split {tier.split} --size {tier.name}"
+                    )
+                task = load_scored_task(tier.scored_on(SUBSET), data_root)
+                model = open_model(
+                    folder,
+                    entry,
+                    prediction,
+                    root=data_root,
+                    registry=rooted,
+                    threads=threads,
+                )
+                name = name_seed(entry, prediction)
+                count = len(task.scenarios)
+                meter.begin(name, total=count, scenarios=count)
+                try:
+                    tallies = predict_tallies(
+                        model,
+                        task,
+                        entry.score.ranking_metric,
+                        task.scenarios,
+                        done=lambda: meter.count(1, scenarios=1),
+                    )
+                finally:
+                    model.close()
+                scores = score(METRICS[entry.score.ranking_metric], tallies)
+                if scores is None or not np.isfinite(scores.values).all():
+                    raise ChecksFailedError(f"{name}: no finite score on {SUBSET}")
+                values = {}
+                for scenario, value in zip(
+                    scores.scenarios, scores.values.tolist(), strict=True
+                ):
+                    values[scenario] = round_digits(value, DIGITS)
+                written = ShiftModel(
+                    seed=prediction.seed,
+                    model=prediction.weights.sha256,
+                    values=values,
+                )
+                subset_sha256 = manifest.subset_sha256[SUBSET]
+                record_shift(folder, entry, tier, written, subset_sha256)
+                result.predicted.append(name)
         except LagbenchError as error:
             if entries:
                 raise
-            run.result.failures.append(Failure(entry=path, error=error))
-        scores = run.scores_of(entry)
-        if scores is not None:
-            run.result.entries[path] = scores
-    return run.result
-
-
-def _has_shift(entry: Entry, registry: Registry) -> bool:
-    """Tell whether the data set of an entry has the subset ``shift``."""
-    return SUBSET in registry.size(entry.split, entry.size).subsets
-
-
-def _require_some(
-    chosen: Sequence[Entry], folder: Folder, split: str | None, size: str | None
-) -> None:
-    """Refuse a choice of data sets in which there is nothing to run."""
-    if chosen:
-        return
-    raise UsageError(
-        f"no entry to score on {SUBSET}",
-        where=str(folder.path),
-        expected=f"active entries with models, of data sets with {SUBSET}",
-        got=f"none of --split {split or 'any'} and --size {size or 'any'}",
-        fix="`lagbench list` shows the subsets of a data set",
-    )
-
-
-@dataclass(kw_only=True)
-class _ShiftRun:
-    """One run of the command: its choices, and what it has loaded."""
-
-    folder: Folder
-    root: Path
-    registry: Registry
-    again: bool
-    threads: int
-    meter: Meter
-    result: ShiftResult
-    _tasks: dict[tuple[str, str], ScoredTask] = field(default_factory=dict)
-
-    def score(self, entry: Entry) -> None:
-        """Score all models of an entry that have no scores yet."""
-        size = self._size(entry)
-        for prediction in entry.predictions:
-            if prediction.weights is None:
-                continue
-            if not self.again and self._is_recorded(entry, prediction):
-                continue
-            task = self._task(entry)
-            # before the predictions, which may take hours
-            subset_sha256 = self._subset_sha256(size)
-            scores = ShiftModel(
-                seed=prediction.seed,
-                model=prediction.weights.sha256,
-                values=self._predict(entry, prediction, task),
-            )
-            record_shift(self.folder, entry, size, scores, subset_sha256=subset_sha256)
-            self.result.predicted.append(name_seed(entry, prediction))
-
-    def scores_of(self, entry: Entry) -> ShiftScores | None:
-        """Return the recorded scores of an entry."""
-        return shift_of(entry, self._size(entry), read_shift(self.folder))
-
-    def _size(self, entry: Entry) -> Size:
-        return self.registry.size(entry.split, entry.size)
-
-    def _subset_sha256(self, size: Size) -> str:
-        """Return the hash of the files of ``shift`` that were predicted."""
-        manifest = read_manifest(self.root, size.split, size.name, size.major)
-        if manifest is None or SUBSET not in manifest.subset_sha256:
-            raise DataError(
-                "the data set has no manifest with the hash of shift",
-                where=str(size.folder(self.root)),
-                expected="a manifest with the hash of the subset",
-                got="none",
-                fix=f"lagbench verify --split {size.split} --size {size.name}",
-            )
-        return manifest.subset_sha256[SUBSET]
-
-    def _is_recorded(self, entry: Entry, prediction: Prediction) -> bool:
-        scores = self.scores_of(entry)
-        if scores is None:
-            return False
-        return any(one.seed == prediction.seed for one in scores.models)
-
-    def _task(self, entry: Entry) -> ScoredTask:
-        key = (entry.split, entry.size)
-        if key not in self._tasks:
-            size = self._size(entry).scored_on(SUBSET)
-            self._tasks[key] = load_scored_task(size, self.root)
-        return self._tasks[key]
-
-    def _predict(
-        self, entry: Entry, prediction: Prediction, task: ScoredTask
-    ) -> dict[int, float]:
-        """Return the ranking metric of a model in each scenario."""
-        metric = entry.score.ranking_metric
-        name = name_seed(entry, prediction)
-        model = open_model(
-            self.folder,
-            entry,
-            prediction,
-            root=self.root,
-            registry=self.registry,
-            threads=self.threads,
-        )
-        count = len(task.scenarios)
-        self.meter.begin(f"{name}, shift", total=count, scenarios=count)
-        values = {}
-        try:
-            for scenario in task.scenarios:
-                position = model.predict(task.truth.path(scenario))
-                tally = score_positions(task, scenario, position, metric)
-                value = score(METRICS[metric], {scenario: tally})
-                if value is None or not np.isfinite(value.mean):
-                    raise ChecksFailedError(
-                        "the ranking metric has no value",
-                        where=f"{name}, scenario {scenario}",
-                        expected=metric,
-                        got="no finite value",
-                        fix="see whether the data are sound: lagbench verify",
-                    )
-                values[scenario] = round_digits(value.mean, DIGITS)
-                self.meter.count(1, scenarios=1)
-        finally:
-            model.close()
-        return values
+            result.failures.append(Failure(entry="/".join(entry.place), error=error))
+        present = shift_of(entry, tier, read_shift(folder))
+        if present is not None:
+            result.entries[path] = present
+    return result

@@ -1,46 +1,118 @@
 """Score predictions and write the entry: ``lagbench submit``.
 
-Everything that can be refused is refused before the scoring: first the arguments, all
-mistakes together, then all that does not fit the files. `publish` then writes the
-entry; ``lagbench leaderboard build`` draws the board's page anew.
+All files are written to a temporary folder of the leaderboard and then moved to their
+places, the YAML file last. ``lagbench leaderboard build`` draws the page anew.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import re
+import shutil
+import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 
+from lagbench.data.checksums import file_sha256
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
-from lagbench.errors import UsageError, UsageErrorCollector, WorkFailedError
+from lagbench.errors import (
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+    check_installed,
+)
+from lagbench.models.onnx_model import check_onnx
+from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
+from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
+from lagbench.scoring.score_file_writer import write_statistics
 from lagbench.submission.checks import outside_share
-from lagbench.submission.format import WRITE
+from lagbench.submission.format import WRITE, Header
 from lagbench.submission.issues import ValidationResult
 from lagbench.submission.other_files import refuse_other_files
 from lagbench.submission.predictions import open_predictions
-from lagbench.submission.validation import validate
+from lagbench.submission.validation import validate as validate_predictions
 from lagbench.work.run import Progress
 
-from .describe import draft_entry
-from .draft import Draft, PredictionsFile
-from .entry import OUTSIDE, Meta
-from .fields import MOST_SEEDS
-from .folder import Folder
-from .identity import fingerprint_of, fingerprints_of_entries
-from .lock import board_lock
-from .publish import SubmitResult, complete_interrupted, publish
-from .seeds import require_new
+from .entry import (
+    LONGEST_TEXT,
+    MOST_SEEDS,
+    About,
+    DataSet,
+    Entry,
+    EntryBudget,
+    Meta,
+    Prediction,
+    ScoreBlock,
+    Weights,
+    entry_bytes,
+    mean_cost,
+    read_entry,
+    today,
+    validate,
+)
+from .folder import REFERENCES as FLOORS
+from .folder import (
+    SHIFT,
+    VERIFIED,
+    Folder,
+    Place,
+    entry_path,
+    score_paths,
+    weights_path,
+)
+from .ranking import OUTSIDE, combine, scored_file, summarise
+from .shift import remove_stale_scores
+from .verified import remove_stale_record
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
 
-NEEDED_KEYS = {
-    "authors": "--author NAME",
-    "command": "--command 'what makes the predictions again'",
-}
-"""Keys that readers of the board need, and the options that give them."""
+TRAINING_LOG = "training.json"
+
+LONGEST_NAME = 100
+
+NO_PREDICTIONS = 64 * "0"
+"""Hash in score files of reference predictors."""
+
+SHARED_LABELS = ("split", "size", "dataset_sha256", "method")
+"""Labels of predictions that all seeds of a method share."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictionsFile:
+    """A valid file of predictions."""
+
+    path: Path
+    header: Header
+    sha256: str  # content hash
+    validation: ValidationResult
+    # share of positions beyond the box, where the validation warns
+    outside_share: float | None
+    weights: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmitResult:
+    """An entry that was written."""
+
+    split: str
+    size: str
+    method: str
+    ranking: str  # name of the ranking metric
+    mean: float | None  # of it over scenarios and seeds; None where undefined
+    std: float | None  # over seeds; None for one seed
+    flags: tuple[str, ...]  # names of flags that were raised
+    has_cost: bool  # whether the entry states the time of a frame
+    board: Path
+    files: tuple[Path, ...]  # files that were written
+    removed: tuple[Path, ...]  # files that only the entry before had
 
 
 def submit(
@@ -51,7 +123,6 @@ def submit(
     board: str | Path = BOARD,
     root: str | Path | None = None,
     replace: bool = False,
-    add: bool = False,
     new_board: bool = False,
     workers: int | None = None,
     registry: Registry | None = None,
@@ -66,13 +137,10 @@ def submit(
         predictions: files of predictions, one per seed.
         meta: description of the method.
         weights: weights that made the predictions, at most one file per seed; they are
-            kept beside the entry.
+            copied to the leaderboard.
         board: the leaderboard's folder.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         replace: whether the entry replaces the one of that name.
-        add: whether the files are further seeds of the entry of that name. Its other
-            predictions need not be at hand; its description stays, except for the keys
-            in ``meta``.
         new_board: whether the folder may be a new one.
         workers: worker processes; by default one per core where the work is worth it.
         registry: where splits are described; ours when None.
@@ -80,42 +148,49 @@ def submit(
         examined: called with the result of each validation.
 
     Raises:
-        UsageError: a key is missing, the entry is there already or, with ``add``, is
-            not or has changed meanwhile, the files do not belong together, name or
-            predictions are another's, or no leaderboard.
+        UsageError: authors or command are missing, the entry is there already, the
+            files do not belong together, or no leaderboard.
         UnreadableFileError: predictions or weights cannot be read.
-        ChecksFailedError: predictions are not valid; with ``add``, a file beside the
-            entry is not the one that it names.
+        ChecksFailedError: predictions are not valid, or the description does not fit.
         DataError: the test subset is missing, or the predictions were made from another
             data set.
         WorkFailedError: the disk is full or not writable, or a score file became too
             long.
     """
     folder = Folder(board)
-    paths = [Path(path) for path in predictions]
-    _require_fit_arguments(
-        folder, paths, meta, replace=replace, add=add, new_board=new_board
-    )
+    if not meta.authors or not meta.command:
+        raise UsageError("an entry needs authors and command; write them to meta.yaml")
+    if not 1 <= len(predictions) <= MOST_SEEDS:
+        raise UsageError(f"submit takes 1 to {MOST_SEEDS} files, one per seed")
+    for path in map(Path, predictions):
+        refuse_other_files(path)
+    if new_board:
+        folder.require_room()
+    else:
+        folder.require()
 
     full_registry = registry or load()
     files = []
-    for path in paths:
-        result = validate(path, root=root, require_truth=True, registry=registry)
-        if examined is not None:
-            examined(result)
-        result.check()
-        files.append(_read_predictions(path, result, full_registry))
-
-    def draft() -> Draft:
-        return draft_entry(
-            files, meta, folder=folder, weights=weights, replace=replace, add=add
+    for path in map(Path, predictions):
+        check_file(path, fix=WRITE)
+        validation = validate_predictions(
+            path, root=root, require_truth=True, registry=registry
         )
+        if examined is not None:
+            examined(validation)
+        validation.check()
+        files.append(_read_predictions(path, validation, full_registry))
+    _require_seeds_of_one_method([file.header for file in files])
+    files = _with_weights(files, [Path(path) for path in weights])
+    place = _place_of(files[0].header, meta)
+    if (folder.path / entry_path(place)).exists() and not replace:
+        raise UsageError(
+            f"the leaderboard has an entry {'/'.join(place)}; --replace replaces it, "
+            "or name another --method"
+        )
+    about = _describe([file.header for file in files], meta)
 
-    if folder.staging_folders():
-        with board_lock(folder):
-            complete_interrupted(folder)
-    draft()  # errors that need no scores come before the scoring
-    cards: list[ScoreCard] = []
+    cards = []
     for file in files:
         card = score(
             file.path,
@@ -128,122 +203,34 @@ def submit(
             validated=file.validation,
         )
         cards.append(card)
-    fingerprints = [fingerprint_of(card.tallies[SUBMISSION]) for card in cards]
     try:
-        # the leaderboard may have changed while the files were scored
-        with board_lock(folder):
-            complete_interrupted(folder)
-            current = draft()
-            known_fingerprints = fingerprints_of_entries(
-                folder, current.entries_to_differ_from
-            )
-            require_new(fingerprints, paths, known_fingerprints)
-            return publish(current, files, cards, folder)
+        with folder.lock():
+            return _publish(folder, place, about, meta, files, cards)
     except OSError as error:
         raise WorkFailedError(
-            "cannot write there",
-            where=str(error.filename or folder.path),
-            expected="a folder that you may write to, on a disk with space",
-            got=error.strerror or error,
-            fix="free disk space, or name a folder that you may write to: --board",
+            f"cannot write {error.filename or folder.path}: {error.strerror}; free "
+            "disk space, or name another folder: --board"
         ) from error
-
-
-def _require_fit_arguments(
-    folder: Folder,
-    paths: Sequence[Path],
-    meta: Meta,
-    *,
-    replace: bool,
-    add: bool,
-    new_board: bool,
-) -> None:
-    """Refuse together all that is wrong before any file is read."""
-    errors = UsageErrorCollector()
-    with errors:
-        if add and replace:
-            raise UsageError(
-                "--add and --replace exclude each other",
-                where="--add, --replace",
-                expected="one of the two",
-                got="both",
-                fix="--add for more seeds, --replace for new predictions of all",
-            )
-        if not add:
-            _require_keys(meta)
-    with errors:
-        if new_board:
-            folder.require_room()
-        else:
-            folder.require(
-                "run it from the root of a clone, name it with --board, or begin one: "
-                "--new-board"
-            )
-    with errors:
-        _require_files(paths)
-    errors.raise_errors()
-
-
-def _require_keys(meta: Meta) -> None:
-    missing_options = []
-    for key, option in NEEDED_KEYS.items():
-        if not getattr(meta, key):
-            missing_options.append(option)
-    if missing_options:
-        raise UsageError(
-            "the entry lacks what readers need",
-            where=", ".join(missing_options),
-            expected="a text for each",
-            got="nothing",
-            fix="give them as options, or authors and command in a file: "
-            "--from meta.yaml",
-        )
-
-
-def _require_files(paths: Sequence[Path]) -> None:
-    for path in paths:
-        refuse_other_files(path)
-        check_file(path, fix=WRITE)
-    if not paths:
-        what = "no predictions"
-        fix = "name the predictions: lagbench submit predictions.nc"
-    elif len(paths) > MOST_SEEDS:
-        what = "too many files"
-        fix = "leave some out: further seeds of a method can be added later, with --add"
-    else:
-        return
-    raise UsageError(
-        what,
-        where="FILE ...",
-        expected=f"1 to {MOST_SEEDS}, one per seed",
-        got=len(paths),
-        fix=fix,
-    )
 
 
 def _read_predictions(
     path: Path, validation: ValidationResult, registry: Registry
 ) -> PredictionsFile:
-    """Read header and content hash of valid predictions."""
     with open_predictions(path) as opened:
         header = opened.header
         if header.split not in registry.splits:
             raise UsageError(
-                "no split of a leaderboard",
-                where=str(path),
-                expected=[*registry.splits],
-                got=header.split,
-                fix="a leaderboard takes the splits of lagbench; `lagbench score` and "
-                "`lagbench compare` take a split of your own too",
+                f"{path}: {header.split} is a split of your own; a leaderboard takes "
+                "those of lagbench, `lagbench score` takes yours too"
             )
         if header.subset != "test":
             raise UsageError(
-                "an entry needs predictions of the subset test",
-                where=str(path),
-                expected="test",
-                got=header.subset,
-                fix="submit the predictions of test; `lagbench score` scores these",
+                f"{path}: predictions of the subset {header.subset}; submit those of "
+                "test"
             )
+        provenance = header.provenance
+        if provenance is not None and {"test", "shift"} & set(provenance.subsets):
+            raise UsageError(f"{path}: the model was trained on scored scenarios")
         share = None
         if any(warning.check == OUTSIDE for warning in validation.warnings):
             share = outside_share(opened, registry.size(header.split, header.size))
@@ -254,3 +241,274 @@ def _read_predictions(
             validation=validation,
             outside_share=share,
         )
+
+
+def _require_seeds_of_one_method(headers: Sequence[Header]) -> None:
+    for name in SHARED_LABELS:
+        labels = {str(getattr(header, name)) for header in headers}
+        if len(labels) > 1:
+            raise UsageError(
+                f"the files differ in {name}: {', '.join(sorted(map(ascii, labels)))}; "
+                "submit each method on its own"
+            )
+    seeds = [header.seed for header in headers]
+    if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
+        raise UsageError(
+            f"several files need different seeds, got {seeds}; write them with "
+            "submission.write(..., seed=0), seed=1 and so on"
+        )
+
+
+def _with_weights(
+    files: Sequence[PredictionsFile], paths: Sequence[Path]
+) -> list[PredictionsFile]:
+    """Return the files with their weights: by seed, ONNX files in their order."""
+    if len(paths) > len(files):
+        raise UsageError("more files of weights than predictions; give one per seed")
+    weights_of_seed: dict[int, Path] = {}
+    seeds = [file.header.seed or 0 for file in files]
+    for number, path in enumerate(paths):
+        header = files[0].header
+        if path.suffix == ".onnx":
+            split = check_onnx(path).split or header.split
+            seed = seeds[number]
+        else:
+            check_installed("torch", extra="baselines")
+            from lagbench.baselines.weights_file import inspect_weights
+
+            inspected = inspect_weights(path)
+            split = inspected.data_set[0]
+            seed = inspected.seed
+        if split != header.split or seed not in seeds:
+            raise UsageError(
+                f"{path} holds weights of {split}, seed {seed}; the predictions are of "
+                f"{header.split}, seeds {seeds}"
+            )
+        weights_of_seed[seed] = path
+    paired = []
+    for file, seed in zip(files, seeds, strict=True):
+        paired.append(replace(file, weights=weights_of_seed.get(seed)))
+    return paired
+
+
+def _place_of(header: Header, meta: Meta) -> Place:
+    """Return split, size and method; the label of predictions may name the method."""
+    method = meta.method or header.method
+    if re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", method) is None or len(method) > 60:
+        suggestion = re.sub("[^a-z0-9]+", "-", method.lower()).strip("-")[:60]
+        raise UsageError(
+            f"{method!a} cannot name an entry; name it: --method "
+            f"{suggestion or 'my-model'}"
+        )
+    if method in REFERENCES:
+        raise UsageError(
+            f"{method} is the name of a reference predictor; name another: --method"
+        )
+    return header.split, header.size, method
+
+
+def _describe(headers: Sequence[Header], meta: Meta) -> About:
+    """Return the description of the method: keys of meta, else of the predictions."""
+    header = headers[0]
+    keys = {name: getattr(meta, name) for name in About.model_fields}
+    keys["name"] = meta.name or header.method[:LONGEST_NAME]
+    keys["date"] = meta.date or today()
+    keys["training"] = meta.training or (header.training or "")[:LONGEST_TEXT]
+    if meta.parameters is None:
+        keys["parameters"] = header.parameters
+    if meta.cost is None:
+        keys["cost"] = mean_cost(headers, meta.solver_seconds_per_frame)
+    mean_budget = EntryBudget.mean_over_seeds(
+        header.size, [header.budget for header in headers]
+    )
+    if mean_budget is not None:
+        keys["budget"] = mean_budget
+    return validate(About, keys, "the description")
+
+
+def _publish(
+    folder: Folder,
+    place: Place,
+    about: About,
+    meta: Meta,
+    files: Sequence[PredictionsFile],
+    cards: Sequence[ScoreCard],
+) -> SubmitResult:
+    """Write the entry with its files; remove files that it no longer has."""
+    previous = None
+    if (folder.path / entry_path(place)).exists():
+        previous = read_entry(folder.path / entry_path(place))
+    with tempfile.TemporaryDirectory(prefix=".submit-", dir=folder.path) as scratch:
+        staging = _Staging(folder, Path(scratch))
+        predictions = []
+        scored_files = []
+        paths = score_paths(place, [file.header.seed for file in files])
+        urls = meta.urls or [None] * len(files)
+        for file, card, path, url in zip(files, cards, paths, urls, strict=True):
+            copy = staging.add(path)
+            write_statistics(card, copy, option="--board")
+            if copy.stat().st_size > MAX_SCORE_BYTES:
+                raise WorkFailedError(
+                    f"the scores take more than {MAX_SCORE_BYTES} bytes; no "
+                    "leaderboard takes a data set of so many scenarios"
+                )
+            scored_files.append(scored_file(card, copy, file.outside_share))
+            predictions.append(
+                Prediction(
+                    seed=file.header.seed,
+                    sha256=file.sha256,
+                    url=url,
+                    bytes=file.path.stat().st_size,
+                    budget=file.header.budget,
+                    provenance=file.header.provenance,
+                    weights=_stage_weights(folder, staging, place, file),
+                )
+            )
+        tallies = [card.tallies[SUBMISSION] for card in cards]
+        split, size, method = place
+        header = files[0].header
+        entry = validate(
+            Entry,
+            {
+                **dict(about),
+                "format": 2,
+                "split": split,
+                "size": size,
+                "method": method,
+                "dataset": DataSet(
+                    version=header.dataset_version, sha256=header.dataset_sha256
+                ),
+                "predictions": tuple(predictions),
+                "score": ScoreBlock(
+                    lagbench=version("lagbench"),
+                    dataset_sha256=header.dataset_sha256,
+                    ranking_metric=cards[0].ranking,
+                    files=tuple(scored_files),
+                    metrics=summarise(combine(tallies)),
+                ),
+            },
+            "the entry",
+        )
+        staging.add(entry.yaml_path).write_bytes(entry_bytes(entry))
+        references = _write_references(cards[0], folder)
+        staging.move()
+
+    written = [folder.path / path for path in staging.copies]
+    if remove_stale_record(folder, entry):
+        written.append(folder.path / VERIFIED)
+    if remove_stale_scores(folder, entry):
+        written.append(folder.path / SHIFT)
+    removed = _remove_stale_files(folder, entry, previous)
+    summary = entry.score.metrics[entry.score.ranking_metric]
+    flags: dict[str, None] = {}
+    for scored in entry.score.files:
+        flags.update(dict.fromkeys(flag.name for flag in scored.flags))
+    return SubmitResult(
+        split=split,
+        size=size,
+        method=method,
+        ranking=entry.score.ranking_metric,
+        mean=summary.mean,
+        std=summary.std,
+        flags=tuple(flags),
+        has_cost=entry.cost is not None,
+        board=folder.path,
+        # the entry first, although it is moved last
+        files=(*reversed(written), *references),
+        removed=removed,
+    )
+
+
+@dataclass(frozen=True)
+class _Staging:
+    """New files of the leaderboard that are not in their places yet."""
+
+    folder: Folder
+    scratch: Path
+    copies: dict[Path, Path] = field(default_factory=dict)
+
+    def add(self, path: Path) -> Path:
+        """Return where the file of a place is written first."""
+        self.copies[path] = self.scratch / f"{len(self.copies)}{path.suffix}"
+        return self.copies[path]
+
+    def move(self) -> None:
+        """Move all files to their places, in the order in which they were added."""
+        for path, copy in self.copies.items():
+            place = self.folder.path / path
+            place.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(copy, place)
+
+
+def _stage_weights(
+    folder: Folder, staging: _Staging, place: Place, file: PredictionsFile
+) -> Weights | None:
+    """Copy weights and the log of their training, unless they lie there already."""
+    source = file.weights
+    if source is None:
+        return None
+    sha256 = file_sha256(source)
+    board = folder.path.resolve()
+    if source.resolve().is_relative_to(board):
+        inner = source.resolve().relative_to(board)
+        return Weights(path=inner.as_posix(), sha256=sha256)
+    path = weights_path(place, file.header.seed, source)
+    shutil.copyfile(source, staging.add(path))
+    for log in (source.with_suffix(".json"), source.with_name(TRAINING_LOG)):
+        # the JSON file that `lagbench predict` writes about costs has no step
+        if log.is_file() and "step" in json.loads(log.read_bytes()):
+            shutil.copyfile(log, staging.add(path.with_suffix(".json")))
+            break
+    return Weights(path=path.as_posix(), sha256=sha256)
+
+
+def _remove_stale_files(
+    folder: Folder, entry: Entry, previous: Entry | None
+) -> tuple[Path, ...]:
+    """Remove scores and weights of the entry before that nothing names any more."""
+    if previous is None:
+        return ()
+    stale = set(previous.score_paths) - set(entry.score_paths)
+    for prediction in previous.predictions:
+        if prediction.weights is not None:
+            path = Path(prediction.weights.path)
+            stale |= {path, path.with_suffix(".json")}
+    for path in folder.entries():
+        for prediction in read_entry(folder.path / path).predictions:
+            if prediction.weights is not None:
+                used = Path(prediction.weights.path)
+                stale -= {used, used.with_suffix(".json")}
+    removed = []
+    for path in sorted(stale):
+        if (folder.path / path).is_file():
+            (folder.path / path).unlink()
+            removed.append(folder.path / path)
+    return tuple(removed)
+
+
+def _write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
+    """Write the references of a score card that the folder lacks; return the files."""
+    header = card.header
+    data_set_folder = folder.path / FLOORS / header.split / header.size
+    written = []
+    for name in card.tallies.keys() - {SUBMISSION}:
+        path = data_set_folder / f"{name}.nc"
+        if _is_scored_on(path, header.dataset_sha256):
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        reference_card = replace(
+            card,
+            header=replace(header, method=name),
+            predictions_sha256=NO_PREDICTIONS,
+            tallies={SUBMISSION: card.tallies[name]},
+        )
+        write_statistics(reference_card, path, option="--board")
+        written.append(path)
+    return tuple(sorted(written))
+
+
+def _is_scored_on(path: Path, dataset_sha256: str) -> bool:
+    with suppress(UnreadableFileError):
+        identity = read_score_file(path).scores.identity
+        return identity["dataset_sha256"] == dataset_sha256
+    return False

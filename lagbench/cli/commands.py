@@ -185,15 +185,15 @@ COMMANDS = (
         "Leaderboard",
         "leaderboard check",
         "leaderboard:check_command",
-        "Check all entries, score files and aggregates of the leaderboard.",
+        "Check all entries, score files and weights of the leaderboard.",
         "leaderboard check",
     ),
     Command(
         "Leaderboard",
         "leaderboard picture",
         "leaderboard:picture_command",
-        "Draw the accuracy of models against their cost as an SVG file.",
-        "leaderboard picture cavity --size mini -o cost.svg",
+        "Draw error against cost as a file: a small panel for each data set.",
+        "leaderboard picture --size mini -o front.svg",
     ),
     Command(
         "Leaderboard",

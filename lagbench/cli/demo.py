@@ -14,11 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lagbench.board.build import BuildResult, build
 from lagbench.board.entry import Meta
 from lagbench.board.folder import Folder
-from lagbench.board.publish import SubmitResult
-from lagbench.board.submit import submit
+from lagbench.board.page import BuildResult, build
+from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import round_digits
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry, load

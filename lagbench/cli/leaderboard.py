@@ -6,40 +6,25 @@ They are build, check, picture, reproduce, shift and show.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveInt
 
-from lagbench.atomic import check_output_file, write_atomically
+from lagbench.atomic import check_output_file
 from lagbench.board.blind import BlindScore, score_blind
-from lagbench.board.build import build, collect
 from lagbench.board.check import CheckResult, check_board
-from lagbench.board.cost import picture
 from lagbench.board.folder import Folder
-from lagbench.board.measured_cost import TIMED_FRAMES
-from lagbench.board.reproduce import ReproduceResult, reproduce
-from lagbench.board.selection import choose_data_sets, name_submit_command
+from lagbench.board.models import choose_data_sets
+from lagbench.board.page import build
+from lagbench.board.reproduce import TIMED_FRAMES, ReproduceResult, reproduce
+from lagbench.board.rows import collect
 from lagbench.board.shift import scores_of_seeds
 from lagbench.board.shift_run import ShiftResult, score_on_shift
-from lagbench.board.show import (
-    SCOPE_OF_JSON,
-    scope_of_tables,
-    tables,
-    to_plain,
-)
-from lagbench.data.local import locate_new, resolve_root
-from lagbench.data.registry import Size
-from lagbench.errors import (
-    DataError,
-    UsageError,
-    check_regular,
-    format_count,
-)
-from lagbench.references.shipped import shipped
+from lagbench.board.show import tables, to_plain
+from lagbench.errors import UsageError, check_installed, check_regular, format_count
 from lagbench.scoring.boards import find_board
-from lagbench.scoring.references import sizes_with_test_files
 
 from .options import (
     DEFAULT_BOARD,
@@ -47,7 +32,6 @@ from .options import (
     DrawSeedOption,
     FoundBoardOption,
     JsonFlag,
-    NewSizeOption,
     OverwriteFlag,
     QuietFlag,
     RootOption,
@@ -105,151 +89,73 @@ def build_command(
 def check_command(
     *,
     board: FoundBoardOption = None,
-    base: str | None = None,
-    own: list[str] | None = None,
-    page: bool = False,
     predictions: list[Path] | None = None,
     recording: Annotated[bool, Parameter(name="--record")] = False,
-    root: str | None = None,
-    split: str | None = None,
-    size: str | None = None,
+    root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> int:
-    """Check all entries, score files and aggregates of the leaderboard.
+    """Check all entries, score files and weights of the leaderboard.
 
     Every pull request runs these checks.
 
     Args:
-        base: Report changes to entries that this git commit has.
-        own: With --base: an entry that is yours; repeatable.
-        page: Also check that the files index.html and schema.json are up to date.
         predictions: Score an entry's predictions again; repeatable.
         recording: With --predictions: add confirmed entries to verified.yaml.
-        root: Folder of all data sets. Without --predictions, the shipped scores of
-            reference predictors are measured again on these data.
-        split: With --root: measure on this split only.
-        size: With --root: measure on this size only.
     """
-    if (split or size) and not root:
-        raise UsageError(
-            "--split and --size choose data to measure again; give --root as well",
-            where="--root",
-        )
     if recording and not predictions:
-        raise UsageError(
-            "there is nothing to record; give --predictions FILE as well",
-            where="--record",
-        )
+        raise UsageError("--record needs --predictions FILE, which is scored again")
     for path in predictions or ():
         check_regular(path)
-    sizes: Sequence[Size] = ()
-    if root is not None and not predictions:
-        sizes = _sizes_to_measure(root, split, size)
     with progress_bar(quiet=quiet or as_json) as progress:
         result = check_board(
             find_board(board, reads=not recording),
-            page=page,
-            base=base,
-            own=own or (),
             predictions=predictions or (),
             recording=recording,
-            measured_sizes=sizes,
             root=root,
             progress=progress,
         )
     if not as_json:
         for issue in result.findings:
-            print_on_stderr(str(issue))
-    lines = _describe_check(result, recording=recording)
-    print_result(result, lines, as_json=as_json, quiet=quiet)
+            print_on_stderr(issue)
+    print_result(result, _describe_check(result), as_json=as_json, quiet=quiet)
     return result.exit_code
 
 
-def _sizes_to_measure(root: str, split: str | None, size: str | None) -> list[Size]:
-    """Return the sizes whose test scenarios lie under a root folder.
-
-    Raises:
-        DataError: there are none.
-    """
-    sizes = sizes_with_test_files(resolve_root(root), split=split, name=size)
-    if not sizes:
-        raise DataError(
-            "no test scenarios are there; make them with `lagbench generate`, or name "
-            "another --root",
-            where=str(root),
-        )
-    return sizes
-
-
-def _describe_check(result: CheckResult, *, recording: bool) -> Iterator[str]:
-    for confirmation in result.confirmed:
-        precision = "exactly"
-        if confirmation.difference != 0.0:
-            precision = f"to {confirmation.difference:.1e}, relative"
-        if confirmation.is_anew:
-            precision += ", predicted anew"
-        yield (
-            f"{confirmation.predictions}: confirms {confirmation.score_file} of "
-            f"{confirmation.entry} {precision}"
-        )
-    for data_set, predictors in result.references.items():
-        yield f"{data_set}: measured again {', '.join(predictors)}"
+def _describe_check(result: CheckResult) -> Iterator[str]:
+    for one in result.confirmed:
+        yield f"{one.predictions}: confirms {one.score_file} of {one.entry}"
     for entry in result.recorded:
         yield f"recorded as verified: {entry}"
-    if recording and not result.findings:
-        for entry in result.partly:
-            yield (
-                f"not recorded: {entry}: "
-                "give the predictions of all its seeds in one call"
-            )
-
-    if result.reproduced_wholly or result.reproduced_partly:
-        wholly = format_count(result.reproduced_wholly, "active entry")
-        yield (
-            f"reproduced: {wholly} on all test scenarios, "
-            f"{result.reproduced_partly} on a part of them"
-        )
     state = "nothing wrong"
     if result.findings:
         state = format_count(len(result.findings), "finding")
-    if result.page_checked:
-        state += ", page compared"
-    entries = format_count(result.entries, "entry")
-    yield f"{result.folder}: {entries}, {state}"
+    yield f"{result.folder}: {format_count(result.entries, 'entry')}, {state}"
 
 
 def picture_command(
-    split: str,
     *,
-    size: NewSizeOption = None,
-    output: Annotated[Path, Parameter(alias="-o")] = Path("cost.svg"),
+    size: str = "mini",
+    output: Annotated[Path, Parameter(alias="-o")] = Path("front.svg"),
     overwrite: OverwriteFlag = False,
     board: FoundBoardOption = None,
     quiet: QuietFlag = False,
 ) -> None:
-    """Draw the accuracy of models against their cost as an SVG file.
+    """Draw error against cost as a file: a small panel for each data set.
 
     Args:
-        split: Name of the split.
-        output: SVG file to write.
+        size: Data sets of this size: mini or full.
+        output: SVG or PNG file to write.
     """
-    tier = locate_new(split, size).size
-    if output.suffix.lower() != ".svg":
-        raise UsageError(
-            f"the picture is an SVG file; -o {output.stem or 'cost'}.svg",
-            where="--output",
-        )
+    if output.suffix.lower() not in (".svg", ".png"):
+        raise UsageError(f"{output} must end in .svg or .png; rename it")
     check_output_file(output, overwrite=overwrite)
+    check_installed("vl_convert", extra="plots")
+    from lagbench.board.charts import write_picture
+
     folder = find_board(board, reads=True)
-    if not shipped(tier):
-        # without references the picture of no entry would be empty
-        choose_data_sets(
-            Folder(folder).data_sets(), tier.split, tier.name, board=folder
-        )
-    model = collect(folder, only=[(tier.split, tier.name)])
-    svg = picture(model, tier)
-    write_atomically(output, svg.encode(), option="--output")
+    chosen = choose_data_sets(Folder(folder).data_sets(), None, size, board=folder)
+    write_picture(collect(folder, only=chosen, metrics=()), output)
     print_line(str(output), quiet=quiet)
 
 
@@ -292,9 +198,11 @@ def reproduce_command(
         threads: Threads of a model on the CPU.
     """
     if bool(entries) == every:
-        raise UsageError("name entries, as in cavity/mini/gns, or ask for --all")
-    if (costs and no_costs) or (scenarios is not None and scenarios < 1):
-        raise UsageError("--costs and --no-costs, or --scenarios 0; leave one out")
+        raise UsageError("name entries, as in cavity/mini/gns, or give --all")
+    if costs and no_costs:
+        raise UsageError("--costs and --no-costs exclude each other; leave one out")
+    if scenarios is not None and scenarios < 1:
+        raise UsageError(f"--scenarios {scenarios} predicts nothing; give 1 or more")
     if draw_seed is not None:
         with progress_bar(quiet=quiet or as_json) as progress:
             scores = score_blind(
@@ -355,7 +263,7 @@ def _time_solver(split: str, size: str) -> float | None:
 def _describe_reproduced(
     result: ReproduceResult, *, with_scores: bool, with_costs: bool
 ) -> Iterator[str]:
-    """Yield a text line for each seed and each cost, fixes, then the totals.
+    """Yield a line for each seed and each cost, then the totals.
 
     Args:
         result: what was run, and what was recorded before.
@@ -382,8 +290,6 @@ def _describe_reproduced(
                 f"({seed_result.difference:.1e} relative, {seed_result.scenarios} "
                 f"of {seed_result.of} scenarios){remark}"
             )
-        if path in result.differing:
-            yield _name_fix_of_difference(PurePath(path), result.folder)
         if verification.cost is not None and with_costs:
             cost = verification.cost
             yield (
@@ -395,17 +301,6 @@ def _describe_reproduced(
         f"{result.folder}: {format_count(len(result.lines), 'entry')}, "
         f"{format_count(len(result.differing), 'difference')}, "
         f"{format_count(len(result.failures), 'failure')}"
-    )
-
-
-def _name_fix_of_difference(entry_path: PurePath, board: Path) -> str:
-    """Return the fix for an entry whose model does not give the entry's scores."""
-    _, split, size, _ = entry_path.parts
-    submit = name_submit_command(entry_path, board)
-    return (
-        "  fix: if the predictions were made with other weights, predict again with "
-        "those of the entry and replace the entry: lagbench predict FILE "
-        f"--split {split} --size {size} -o PREDICTIONS.nc; {submit}"
     )
 
 
@@ -438,7 +333,7 @@ def shift_command(
         threads: Threads of a model on the CPU.
     """
     if bool(entries) == every:
-        raise UsageError("name entries, as in cavity/mini/gns, or ask for --all")
+        raise UsageError("name entries, as in cavity/mini/gns, or give --all")
     folder = find_board(board)
     with progress_bar(quiet=quiet or as_json) as progress:
         if not quiet:
@@ -484,7 +379,6 @@ def show_command(
     *,
     size: str | None = None,
     metric: list[str] | None = None,
-    wide: bool = False,
     board: FoundBoardOption = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -494,20 +388,17 @@ def show_command(
         split: Name of the split; all by default.
         size: tiny, mini or full; all by default.
         metric: Metric to show; repeatable.
-        wide: Show variants, deviations and the first metrics of each data set.
     """
     folder = find_board(board, reads=True)
     data_sets = Folder(folder).data_sets()
     chosen = choose_data_sets(data_sets, split, size, board=folder)
-    scope = scope_of_tables(metric or (), wide=wide)
-    if as_json:
-        scope = SCOPE_OF_JSON
-    model = collect(folder, only=chosen, scope=scope)
+    metrics = None if as_json else metric or ()
+    model = collect(folder, only=chosen, metrics=metrics)
     if as_json:
         print_json(to_plain(model))
         return
 
-    print_tables(tables(model, metric or (), wide=wide))
+    print_tables(tables(model, metric or ()))
     if model.tabs:
         return
     if data_sets:

@@ -9,10 +9,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from lagbench.board.entry_file import read_meta
+from lagbench.board.entry import read_meta
 from lagbench.board.folder import SHIFT, VERIFIED
-from lagbench.board.publish import SubmitResult
-from lagbench.board.submit import submit
+from lagbench.board.submit import SubmitResult, submit
 
 from .options import (
     DEFAULT_BOARD,
@@ -31,11 +30,8 @@ def submit_command(
     *,
     source: Annotated[Path | None, Parameter(name="--from")] = None,
     method: str | None = None,
-    authors: Annotated[list[str] | None, Parameter(name="--author")] = None,
-    command: str | None = None,
     weights: list[Path] | None = None,
     replace: bool = False,
-    add: bool = False,
     new_board: bool = False,
     board: BoardOption = DEFAULT_BOARD,
     root: RootOption = None,
@@ -49,22 +45,13 @@ def submit_command(
 
     Args:
         predictions: A predictions.nc for each seed.
-        source: YAML file that describes the method, see docs/submitting.md; other
-            options override it.
+        source: YAML file that describes the method, see docs/submitting.md.
         method: Name of the entry, as in my-model.
-        authors: Author; repeatable.
-        command: Command that makes the predictions.
         weights: Files to keep beside the entry; at most one for each seed.
         replace: Replace the entry of that name.
-        add: Add seeds to the entry of that name; keep its other seeds.
         new_board: Begin a leaderboard in the folder of --board.
     """
-    description = {
-        "method": method,
-        "authors": authors,
-        "command": command,
-    }
-    meta = read_meta(source, description)
+    meta = read_meta(source, method)
     with progress_bar(quiet=quiet or as_json) as progress:
         result = submit(
             predictions,
@@ -73,7 +60,6 @@ def submit_command(
             board=board,
             root=root,
             replace=replace,
-            add=add,
             new_board=new_board,
             workers=workers,
             progress=progress,
@@ -101,9 +87,6 @@ def _describe(result: SubmitResult) -> Iterator[str]:
             "same device, or meta.yaml must state cost"
         )
     yield f"written: {', '.join(map(str, result.files))}"
-    if result.kept:
-        paths = ", ".join(map(str, result.kept))
-        yield f"kept from the earlier entry: {paths}"
     if result.removed:
         paths = ", ".join(map(str, result.removed))
         yield f"removed from the earlier entry: {paths}"

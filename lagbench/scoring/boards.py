@@ -49,28 +49,6 @@ def find_board(board: str | Path | None = None, *, reads: bool = False) -> Path:
     return defaults[0]
 
 
-def board_option(board: str | Path) -> str:
-    """Return what a command needs to find a leaderboard: no text for the default one.
-
-    >>> board_option("elsewhere/a board")
-    " --board 'elsewhere/a board'"
-    """
-    defaults = [folder for folder in DEFAULT_BOARDS if is_board(folder)]
-    if defaults and Path(board).resolve() == defaults[0].resolve():
-        return ""
-    return f" --board {shlex.quote(str(board))}"
-
-
-def advise_board_check(board: str | Path) -> str:
-    """Return which command lists the faults of a leaderboard, for errors.
-
-    >>> advise_board_check("trial")
-    'lagbench leaderboard check --board trial lists all that is wrong'
-    """
-    option = board_option(board)
-    return f"lagbench leaderboard check{option} lists all that is wrong"
-
-
 def is_board(folder: Path) -> bool:
     """Return whether a folder has entries, or room for them."""
     return (folder / SUBMISSIONS).is_dir()

@@ -10,8 +10,7 @@ only these references are measured anew, from the start; the others, and all cos
 as they are. Without it each measured scenario is saved under the root folder: an
 interrupted run continues where it stopped. Last a frame of each reference and of the
 solver itself (``lagbench bench``) is timed on one core; with --costs nothing
-else is done. Shipped scores are checked by ``lagbench leaderboard check --root
-FOLDER``.
+else is done. ``git diff`` then shows which shipped scores have changed.
 """
 
 from __future__ import annotations

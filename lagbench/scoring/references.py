@@ -24,7 +24,7 @@ from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import METRICS, select
 from lagbench.references.predictor import ReferencePredictor, given_in
-from lagbench.references.shipped import ReferenceScores, correlation_of, shipped
+from lagbench.references.shipped import ReferenceScores, correlation_of
 from lagbench.references.table import REFERENCES, references_of
 from lagbench.store.copy import update_working_copy
 from lagbench.work.pool import Report
@@ -129,27 +129,6 @@ def _choose_splits(
             chosen.append(one_split)
     # a name that no split has is refused where the first one is looked up
     return chosen or every
-
-
-def remeasure(
-    size: Size, root: Path, *, progress: Callable[[Progress], None] | None = None
-) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Measure the references of a data set again, and compare with the shipped scores.
-
-    References that read train are left out where train is not there. A reference whose
-    scores are not shipped differs in all metrics.
-
-    Returns:
-        The names of the measured references, and by name the metrics that differ.
-    """
-    names = tuple(reference.name for reference in _with_data(size, root))
-    expected = shipped(size) or {}
-    comparable = {}
-    for name in expected:
-        if name in names:
-            comparable[name] = expected[name]
-    measured = measure(size, root, names=names, progress=progress)
-    return names, differences(comparable, measured)
 
 
 @dataclass(frozen=True, kw_only=True)

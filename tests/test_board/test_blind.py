@@ -6,7 +6,7 @@ import pytest
 from model_board import NAME, PATH, ModelBoard
 
 from lagbench.board.blind import score_blind
-from lagbench.board.entry_file import read_entry
+from lagbench.board.entry import read_entry
 from lagbench.data.drawn import DRAWN_IDS, drawn_registry, drawn_root
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario

@@ -16,9 +16,10 @@ from onnx_files import external_data, straight_on
 
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.board.check import check_board
-from lagbench.board.entry import Level, Meta
+from lagbench.board.entry import Meta
 from lagbench.board.reproduce import reproduce
 from lagbench.board.submit import submit
+from lagbench.board.verified import Level
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UnreadableFileError, UsageError
@@ -274,7 +275,7 @@ def test_an_entry_carries_an_onnx_model(
     submit([predictions], meta, weights=[path], board=board, root=root, new_board=True)
     place = board / "weights/curl-noise/tiny/lines_0.onnx"
     assert place.read_bytes() == path.read_bytes()
-    assert check_board(board, isolated=False).findings == ()
+    assert check_board(board).findings == ()
     result = reproduce(board, ["curl-noise/tiny/lines"], costs=False, root=root)
     (line,) = result.lines.values()
     assert line.level is Level.REPRODUCED

@@ -14,9 +14,10 @@ from simple_models import SMALL
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.predict import predict
 from lagbench.board.check import check_board
-from lagbench.board.entry import Level, Meta
+from lagbench.board.entry import Meta
 from lagbench.board.reproduce import reproduce
 from lagbench.board.submit import submit
+from lagbench.board.verified import Level
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.models.registered import build_registered, export_safetensors
@@ -83,7 +84,7 @@ def test_an_entry_carries_a_file_of_safetensors(
     submit([predictions], meta, board=board, root=root, new_board=True, weights=[path])
     weights = board / "weights/curl-noise/tiny/own_0.safetensors"
     assert weights.read_bytes() == path.read_bytes()
-    assert check_board(board, root=root, isolated=False).findings == ()
+    assert check_board(board, root=root).findings == ()
 
     result = reproduce(board, ["curl-noise/tiny/own"], root=root, costs=False)
     (line,) = result.lines.values()

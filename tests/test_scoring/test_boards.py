@@ -6,12 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.board.folder import Folder
-from lagbench.board.selection import choose_entries
-from lagbench.data.registry import load
 from lagbench.errors import UsageError
 from lagbench.scoring.boards import (
-    board_option,
     find_board,
     require_board,
     suggest_board,
@@ -56,11 +52,6 @@ def test_no_other_leaderboard_is_offered_to_write_into(board: str, here: Path) -
         assert "root of the clone" in str(caught.value.fix)
 
 
-def test_a_command_names_a_board_that_is_not_the_default(here: Path) -> None:
-    assert board_option(here / "leaderboard") == ""
-    assert board_option("autumn-board") == " --board autumn-board"
-
-
 def test_the_leaderboard_that_has_an_entry_is_named(here: Path) -> None:
     """Its option helps more than a similar entry of the leaderboard that was read."""
     for board, method in (("leaderboard", "mlp"), ("autumn-board", "small")):
@@ -73,10 +64,6 @@ def test_the_leaderboard_that_has_an_entry_is_named(here: Path) -> None:
     for name in ("cavity/mini/none", "small", "../mini/small", "a\0/b/c"):
         assert suggest_board(name) is None
 
-    with pytest.raises(UsageError) as caught:
-        choose_entries(Folder("leaderboard"), [entry], load())
-    assert "--board autumn-board" in str(caught.value.fix)
-    assert "did you mean" not in str(caught.value.fix)
     with pytest.raises(UsageError, match="no such entry") as caught:
         compare(entry, "persistence", board="leaderboard")
     assert "--board autumn-board" in str(caught.value.fix)

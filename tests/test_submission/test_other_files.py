@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.board.entry_file import read_meta
+from lagbench.board.entry import Meta
 from lagbench.board.submit import submit
 from lagbench.errors import LagbenchError, UnreadableFileError
 from lagbench.scoring.boards import SUBMISSIONS
@@ -75,10 +75,10 @@ def test_every_reader_of_predictions_says_so(
     monkeypatch.chdir(tmp_path)
     model = write_model(tmp_path / "small.onnx", ".onnx")
     Path("scores.nc").write_bytes(b"")
-    description = {"method": "m", "authors": ["a"], "command": "c"}
+    meta = Meta(method="m", authors=("a",), command="c")
     calls = (
         lambda: score(model),
-        lambda: submit([model], read_meta(None, description), board="trial"),
+        lambda: submit([model], meta, board="trial"),
         lambda: compare(model, "persistence"),
         lambda: compare("scores.nc", model),
     )

@@ -1,0 +1,199 @@
+"""The models of entries: which entries have them, how they are opened and scored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.registry import Registry
+from lagbench.errors import LagbenchError, UsageError, check_installed, suggest_name
+from lagbench.metrics.aggregate import Tally
+from lagbench.metrics.frame import snapshots
+from lagbench.metrics.table import select
+from lagbench.models.onnx_model import open_onnx
+from lagbench.scoring.scenario import SUBMISSION, measure_rows
+from lagbench.scoring.task import ScoredTask
+
+from .entry import Entry, Prediction, Status, find_model, is_current, read_entry
+from .folder import Folder
+
+
+class Runner(Protocol):
+    """A model that predicts scenarios one by one."""
+
+    def predict(
+        self, scenario_file: Path, frames: int | None = None
+    ) -> NDArray[np.float32]:
+        """Return positions of the next frames, [frame, particle, axis] [length]."""
+        ...
+
+    def time(self, scenario_file: Path, frames: int) -> float:
+        """Return the processor time of a frame [s]."""
+        ...
+
+    def close(self) -> None:
+        """Free what the model holds."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """An entry that could not be run."""
+
+    entry: str  # as in "cavity/mini/gns"
+    error: LagbenchError
+
+
+def choose_data_sets(
+    known: Collection[tuple[str, str]],
+    split: str | None,
+    size: str | None,
+    *,
+    board: Path,
+) -> tuple[tuple[str, str], ...]:
+    """Return the (split, size) with entries; only those of a split or size, if given.
+
+    Raises:
+        UsageError: a split or size is given that has no entries.
+    """
+    chosen = []
+    for known_split, known_size in known:
+        if split in (None, known_split) and size in (None, known_size):
+            chosen.append((known_split, known_size))
+    if not chosen and (split or size):
+        request = " ".join(name for name in (split, size) if name)
+        names = [" ".join(data_set) for data_set in known]
+        raise UsageError(
+            f"no entries of {request!a} in {board}; {suggest_name(request, names)}"
+        )
+    return tuple(chosen)
+
+
+def choose_entries(
+    folder: Folder,
+    names: Sequence[str],
+    registry: Registry,
+    *,
+    split: str | None = None,
+    size: str | None = None,
+) -> list[Entry]:
+    """Return entries by name, or all active ones of the present data with models.
+
+    Raises:
+        UsageError: no such entry, or one that has no model; or no entries of the split
+            or size.
+    """
+    known = {}
+    for path in folder.entries():
+        known["/".join(path.with_suffix("").parts[1:])] = path
+    chosen = []
+    for name in names:
+        if name not in known:
+            raise UsageError(
+                f"no entry {name!a} in {folder.path}; {suggest_name(name, known)}"
+            )
+        entry = read_entry(folder.path / known[name])
+        if not entry.has_models:
+            raise UsageError(
+                f"{name} has no model to run; its submitter may add one: lagbench "
+                "submit --weights FILE --replace"
+            )
+        chosen.append(entry)
+    if names:
+        return chosen
+
+    data_sets = choose_data_sets(folder.data_sets(), split, size, board=folder.path)
+    for path in known.values():
+        if path.parts[1:3] not in data_sets:
+            continue
+        entry = read_entry(folder.path / path)
+        present = is_current(entry.dataset, registry.size(entry.split, entry.size))
+        if entry.status is Status.ACTIVE and entry.has_models and present:
+            chosen.append(entry)
+    return chosen
+
+
+def open_model(
+    folder: Folder,
+    entry: Entry,
+    prediction: Prediction,
+    *,
+    root: Path,
+    registry: Registry,
+    threads: int = 1,
+) -> Runner:
+    """Return the model of a seed, ready to predict.
+
+    Raises:
+        UsageError: the seed has no model, or torch is not installed.
+        ChecksFailedError: the file is not the one that the entry names.
+        UnreadableFileError: the file is damaged.
+        DataError: it was trained on other data.
+    """
+    if prediction.weights is None:
+        raise UsageError(f"{name_seed(entry, prediction)} has no model")
+    path = find_model(folder, prediction.weights)
+    if path.suffix == ".onnx":
+        return open_onnx(path, size=registry.size(entry.split, entry.size), root=root)
+
+    check_installed("torch", extra="baselines")
+    from lagbench.baselines.runner import WeightsRunner
+
+    return WeightsRunner(
+        path,
+        size=entry.size,
+        root=root,
+        registry=registry,
+        settings=prediction.settings,
+        threads=threads,
+    )
+
+
+def predict_tallies(
+    model: Runner,
+    task: ScoredTask,
+    metric: str,
+    scenarios: Sequence[int],
+    *,
+    done: Callable[[], None],
+) -> dict[int, Tally]:
+    """Return the statistics that a metric needs, of scenarios that a model predicts.
+
+    Args:
+        model: the model.
+        task: the data set.
+        metric: name of the metric.
+        scenarios: ids of the scenarios.
+        done: called after every scenario.
+    """
+    tallies = {}
+    for scenario in scenarios:
+        position = model.predict(task.truth.path(scenario))
+        tallies[scenario] = score_positions(task, scenario, position, metric)
+        done()
+    return tallies
+
+
+def score_positions(
+    task: ScoredTask, scenario: int, position: NDArray[np.float32], metric: str
+) -> Tally:
+    """Return the statistics of a predicted scenario that a metric needs."""
+    with task.opened(scenario) as truth:
+        rows = {SUBMISSION: snapshots(truth.scenario, position)}
+        tallies, _ = measure_rows(
+            truth.scenario, truth.snapshots(), rows, metrics=select([metric])
+        )
+    return tallies[SUBMISSION]
+
+
+def name_seed(entry: Entry, prediction: Prediction) -> str:
+    """Return the name of one seed of an entry, as in ``cavity/mini/gns, seed 0``."""
+    name = "/".join(entry.place)
+    if prediction.seed is None:
+        return name
+    return f"{name}, seed {prediction.seed}"
