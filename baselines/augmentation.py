@@ -72,41 +72,31 @@ def check_symmetry(
     if size.has_fringe and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
         raise UsageError(
             f"the stream in {size.split} flows along x; in a mirror image it would "
-            "flow backwards",
+            f"flow backwards; set "
+            "model.symmetry=none",
             where="model.symmetry",
-            expected=str(Symmetry.NONE),
-            got=str(symmetry),
-            fix="set model.symmetry=none",
         )
     if symmetry != Symmetry.SQUARE:
         return
     if len(set(size.box.periodic)) > 1:
         raise UsageError(
-            f"only some axes of {size.split} are periodic: axes cannot change places",
+            f"only some axes of {size.split} are periodic: axes cannot change "
+            "places; set model.symmetry=mirror",
             where="model.symmetry",
-            expected=f"{Symmetry.NONE} or {Symmetry.MIRROR}",
-            got=str(symmetry),
-            fix="set model.symmetry=mirror",
         )
     gravity = size.parameters.get("gravity")
     if gravity and gravity.value:
         raise UsageError(
             f"gravity in {size.split} points down; in a rotated image of the square "
-            f"the particles would fall sideways or up",
+            f"the particles would fall sideways or up; "
+            "set model.symmetry=mirror",
             where="model.symmetry",
-            expected=f"{Symmetry.NONE} or {Symmetry.MIRROR} where gravity is "
-            f"{gravity.value}",
-            got=str(symmetry),
-            fix="set model.symmetry=mirror",
         )
     if "body_force" in find_forcing():
         raise UsageError(
             f"a force acts on layers along y in {size.split}: y cannot change places "
-            "with another axis",
+            f"with another axis; set model.symmetry=mirror",
             where="model.symmetry",
-            expected=f"{Symmetry.NONE} or {Symmetry.MIRROR}",
-            got=str(symmetry),
-            fix="set model.symmetry=mirror",
         )
 
 
@@ -252,11 +242,9 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     changes_place = diagonal == 0.0
     if largest_difference > 1e-6 and bool(changes_place.any()):
         raise UsageError(
-            "axes cannot change places in this box",
+            "axes cannot change places in this box: "
+            f"{', '.join(f'{length:g}' for length in lengths)}; use symmetry: mirror",
             where="symmetry",
-            expected="sides of one length",
-            got=", ".join(f"{length:g}" for length in lengths),
-            fix="use symmetry: mirror",
         )
     matrix = matrix.to(batch.position)
     centre = batch.position.new_tensor(middles)
@@ -308,11 +296,9 @@ def _mirror_force(force: Tensor, matrix: Tensor) -> Tensor:
     sign = matrix[:, 1, 1]
     if bool((sign == 0.0).any()):
         raise UsageError(
-            "a force acts on layers along y, which cannot change places with an axis",
+            "a force acts on layers along y, which cannot change places with an axis: "
+            "a rotation; use symmetry: mirror",
             where="symmetry",
-            expected="none or mirror",
-            got="a rotation",
-            fix="use symmetry: mirror",
         )
     image = _multiply(matrix[:, None, None], force)
     reversed_layers = image.flip(2)

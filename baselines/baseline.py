@@ -127,19 +127,15 @@ class Baseline(nn.Module):
         if box.is_periodic:
             periodic = compress(AXES, box.periodic)
             raise UsageError(
-                f"{cls.method} knows boxes with walls only",
+                f"{cls.method} knows boxes with walls only: periodic along "
+                f"{', '.join(periodic)}; {cls._fix_box()}",
                 where=where,
-                expected="walls along every axis",
-                got=f"periodic along {', '.join(periodic)}",
-                fix=cls._fix_box(),
             )
         if box.dimension != 2:
             raise UsageError(
-                f"{cls.method} knows two dimensions only",
+                f"{cls.method} knows two dimensions only: {box.dimension} axes; "
+                f"{cls._fix_box()}",
                 where=where,
-                expected="bounds of x and y",
-                got=f"{box.dimension} axes",
-                fix=cls._fix_box(),
             )
 
     @classmethod
@@ -227,11 +223,8 @@ class Baseline(nn.Module):
             UsageError: the model has no layers to compile; this is the default.
         """
         raise UsageError(
-            f"{self.method} has no layers to compile",
+            f"{self.method} has no layers to compile; leave the option out",
             where="training.compile",
-            expected="false; true for graph networks",
-            got=True,
-            fix="leave the option out",
         )
 
     @abstractmethod
@@ -285,9 +278,8 @@ def last_velocities(
         velocity = box.displacement(before, after)
     if not velocity.shape[1]:
         raise UsageError(
-            "too few frames to start from",
-            expected=f"2 or more, {count + 1} for all",
-            got=position.shape[1],
+            f"too few frames to start from: got {position.shape[1]}, expected 2 or "
+            f"more, {count + 1} for all"
         )
     missing_count = count - velocity.shape[1]
     first_velocity = velocity[:, :1]
@@ -299,11 +291,8 @@ def check_moving_walls(sees_wall_velocity: bool, info: DatasetInfo) -> None:
     """Refuse a model that sees the velocities of walls where no wall moves."""
     if sees_wall_velocity and not info.moving_walls:
         raise UsageError(
-            f"the walls of {info.split} do not move",
+            f"the walls of {info.split} do not move; leave the option out",
             where="model.wall_velocity",
-            expected=False,
-            got=True,
-            fix="leave the option out",
         )
 
 

@@ -232,11 +232,12 @@ def check_data(
     trained = checkpoint.info
     entry = find(checkpoint.baseline)
     try:
-        tier = registry.size(trained.split, size or trained.size)
+        registry.split(trained.split)
     except UsageError as error:
         raise DataError(
             f"no data of the training: {error.text}", where=where
         ) from error
+    tier = registry.size(trained.split, size or trained.size)
     if tier.name != trained.size and not entry.model.any_size:
         raise UsageError(
             f"{entry.model.method} predicts only the size that it was trained on, "

@@ -36,37 +36,25 @@ def read_dataset_info(
     manifest = read_manifest(root_folder, tier.split, tier.name, tier.major)
     if manifest is None:
         raise DataError(
-            "the data set is not generated",
-            where=str(folder),
-            expected="a manifest and scenario files",
-            got="no manifest",
-            fix=hint,
+            f"the data set is not generated: no manifest; {hint}", where=str(folder)
         )
     dataset_sha256 = _find_hash(manifest, tier)
     if dataset_sha256 is None:
         raise DataError(
-            "the data set is not complete",
+            f"the data set is not complete: got {len(manifest.files)} of them, "
+            f"expected all {len(tier.scenarios)} scenarios; {hint}",
             where=str(folder),
-            expected=f"all {len(tier.scenarios)} scenarios",
-            got=f"{len(manifest.files)} of them",
-            fix=hint,
         )
     if not manifest.files:
         raise DataError(
-            "the data set is empty",
+            f"the data set is empty: expected {len(tier.scenarios)} scenarios; {hint}",
             where=str(folder),
-            expected=f"{len(tier.scenarios)} scenarios",
-            got="none",
-            fix=hint,
         )
     statistics = _find_statistics(manifest, tier)
     if not statistics:
         raise DataError(
-            "the subset train is not complete, its statistics are unknown",
+            f"the subset train is not complete, its statistics are unknown; {hint}",
             where=str(folder),
-            expected="all scenarios of train",
-            got="some of them, and no recorded statistics",
-            fix=hint,
         )
 
     first_file = manifest.files[0]

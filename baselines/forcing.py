@@ -101,11 +101,9 @@ class ForcingFeatures(nn.Module):
             return None
         if given.obstacle is None:
             raise DataError(
-                "no obstacle stands in the flow",
+                "no obstacle stands in the flow; train without it: --set "
+                "model.obstacle=false",
                 where=f"{self.info.split} {self.info.size}",
-                expected="obstacle_diameter in each scenario file",
-                got="none",
-                fix="train without it: --set model.obstacle=false",
             )
         return given.obstacle
 
@@ -163,11 +161,8 @@ def require_force(given: Batch, info: DatasetInfo) -> Tensor:
     """
     if given.body_force is None:
         raise DataError(
-            "no force drives the flow",
+            "no force drives the flow; train without it: --set model.body_force=false",
             where=f"{info.split} {info.size}",
-            expected="body_force in each scenario file",
-            got="none",
-            fix="train without it: --set model.body_force=false",
         )
     return given.body_force * info.frame_interval**2
 

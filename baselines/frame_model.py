@@ -72,9 +72,7 @@ class FrameState(nn.Module):
         frame_count = position.shape[-3]
         if frame_count < 2:
             raise DataError(
-                "a velocity needs two frames",
-                expected="2 or more",
-                got=frame_count,
+                f"a velocity needs two frames: {frame_count}, expected 2 or more"
             )
         before = position[..., :-1, :, :]
         after = position[..., 1:, :, :]
@@ -134,11 +132,10 @@ def require_particles(counts: Iterable[int], particles: int) -> None:
     distinct_counts = sorted(set(counts))
     if distinct_counts != [particles]:
         raise DataError(
-            "a model of whole frames needs one number of particles",
+            "a model of whole frames needs one number of particles: got "
+            f"{', '.join(map(str, distinct_counts))}, expected {particles} particles "
+            "in each scenario; train neuralmpm, or a graph network such as gns",
             where="scenarios of this data set",
-            expected=f"{particles} particles in each scenario",
-            got=", ".join(map(str, distinct_counts)),
-            fix="train neuralmpm, or a graph network such as gns",
         )
 
 

@@ -284,11 +284,9 @@ class NeuralMPM(Baseline):
             return given.position.new_zeros(given.windows, 0)
         if given.viscosity is None:
             raise DataError(
-                "the viscosity is not known",
+                "the viscosity is not known; train without it: --set "
+                "model.viscosity=false",
                 where=f"{self.info.split} {self.info.size}",
-                expected="a viscosity in each scenario file, or in the registry",
-                got="none",
-                fix="train without it: --set model.viscosity=false",
             )
         viscosity = given.viscosity.clamp(min=LEAST_VISCOSITY)
         logarithm = torch.log(viscosity / VISCOSITY_UNIT)

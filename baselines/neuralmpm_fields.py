@@ -130,13 +130,12 @@ class FieldEncoder(nn.Module):
             present_materials = sorted(set(material.tolist()))
             all_materials = sorted({*self.options.materials, *present_materials})
             raise DataError(
-                "a material that the model does not know",
+                f"a material that the model does not know: got {present_materials}, "
+                f"expected {list(self.options.materials)}; train with --set "
+                f"'model.materials={all_materials}', or with the numbers of all "
+                "materials of the data; trained weights know only the materials of "
+                "their training",
                 where="model.materials",
-                expected=list(self.options.materials),
-                got=present_materials,
-                fix=f"train with --set 'model.materials={all_materials}', or with the "
-                "numbers of all materials of the data; trained weights know only the "
-                "materials of their training",
             )
         return sample * self.material_count + slot
 

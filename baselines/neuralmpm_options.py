@@ -89,19 +89,17 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
     is_repeated = len(materials) < len(options.materials)
     if not materials or is_repeated or not materials <= set(range(MATERIALS)):
         raise UsageError(
-            "materials are named once each",
+            f"materials are named once each: got {list(options.materials)}, expected "
+            f"some of {list(range(MATERIALS))}; name each material once: --set "
+            "model.materials",
             where="model.materials",
-            expected=f"some of {list(range(MATERIALS))}",
-            got=list(options.materials),
-            fix="name each material once: --set model.materials",
         )
     if options.average and options.symmetry is Symmetry.NONE:
         raise UsageError(
-            "there are no mirror images to average over",
+            f"there are no mirror images to average over: got {options.symmetry}, "
+            f"expected model.symmetry {Symmetry.MIRROR} or {Symmetry.SQUARE}; set "
+            "model.symmetry=mirror too, or leave model.average out",
             where="model.average",
-            expected=f"model.symmetry {Symmetry.MIRROR} or {Symmetry.SQUARE}",
-            got=str(options.symmetry),
-            fix="set model.symmetry=mirror too, or leave model.average out",
         )
 
 
@@ -115,9 +113,7 @@ def _check_box(options: NeuralMPMOptions, info: DatasetInfo) -> None:
         value = getattr(options, name)
         if value:
             raise UsageError(
-                f"{name} needs a two-dimensional box without periodic axes",
+                f"{name} needs a two-dimensional box without periodic axes: {value}; "
+                "leave the option out",
                 where=f"model.{name}",
-                expected="the default",
-                got=value,
-                fix="leave the option out",
             )

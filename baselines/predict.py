@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from lagbench.atomic import check_output_file, write_atomically
+from lagbench.atomic import write_atomically
 from lagbench.data.layout import expand_home
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
@@ -145,20 +145,37 @@ def predict(
         WorkFailedError: out of memory, or the disk is full, or another prediction
             writes the same output.
     """
-    _check_batch(batch)
+    if batch is not None and batch < 1:
+        raise UsageError("--batch is a number of scenarios, 1 or more")
     checkpoint_path = expand_home(checkpoint, "checkpoint")
+    where = str(checkpoint_path)
     trained = load(checkpoint_path)
     output_path = expand_home(output, "--output")
-    check_outputs(output_path, overwrite=overwrite)
-    root_folder = _find_root(split, trained, root, registry)
+    check_predictions_output(output_path, overwrite=overwrite)
+    root_folder = resolve_root(root)
+    if split is not None:
+        location = locate_split(split, root=root, registry=registry)
+        if location.name != trained.info.split:
+            raise UsageError(
+                f"the model was trained on {trained.info.split}; leave --split out, or "
+                "name the folder of that split",
+                where=where,
+            )
+        root_folder = location.root
     known_splits = load_rooted_registry(root_folder, registry)
-    where = str(checkpoint_path)
     info = check_data(
         trained, root=root_folder, registry=known_splits, size=size, where=where
     )
-    paths = _find_scenarios(info, subset, root_folder, known_splits)
+    tier = known_splits.size(info.split, info.size)
+    tier.scored_on(subset)
+    files = scenario_paths(
+        info.split,
+        subset=subset,
+        size=info.size,
+        root=root_folder,
+        registry=known_splits,
+    )
     machine = choose_device(device)
-
     with use_threads(threads):
         model = restore_for_size(
             trained, info, settings, known_splits, root=root_folder, where=where
@@ -166,183 +183,76 @@ def predict(
         if model.computes_on_cpu:
             machine = "cpu"
         model = model.to(machine)
-        side_by_side = _choose_batch(batch, machine, scenarios=len(paths))
-        viscosity = known_splits.size(info.split, info.size).viscosity()
+        if batch is None:
+            batch = 1 if machine == "cpu" else len(files)
         rollouts = _TimedRollouts(
-            model, info, paths, side_by_side, machine, viscosity=viscosity
+            model,
+            info,
+            list(files.values()),
+            min(batch, len(files)),
+            machine,
+            viscosity=tier.viscosity(),
         )
-        label = method or model.method
-        hardware_label = _describe_hardware(machine)
+        found_hardware = hardware(machine)
+        label = str(found_hardware["device"])
+        if machine == "cpu":
+            plural = "s" if rollouts.threads > 1 else ""
+            label = f"{found_hardware['processor']}, {rollouts.threads} thread{plural}"
         writer = PredictionsWriter(
             output_path,
             split=info.split,
             size=info.size,
-            method=label,
+            method=method or model.method,
             subset=subset,
             dataset_sha256=info.dataset_sha256,
             root=root_folder,
             registry=known_splits,
             option="--output",
-            device=hardware_label,
+            device=label,
             parameters=count_parameters(model),
             **_training_attributes(trained, info, settings),
         )
-        solver_seconds_per_frame = _write_rollouts(
-            writer, rollouts, info, time_solver=time_solver, progress=progress
-        )
-        result = _summarise(
-            rollouts,
-            output=output_path,
-            trained_size=trained.info.size,
-            settings=tuple(settings),
-            method=label,
-            device=hardware_label,
-            solver_seconds_per_frame=solver_seconds_per_frame,
-        )
-        _write_costs(result)
-    return result
+        meter = Meter(progress)
+        meter.begin("predicting", total=len(files), scenarios=len(files))
+        solver_seconds = None
+        with writer:
+            for rollout in rollouts:
+                position = rollout.position.numpy()
+                writer.add(rollout.scenario, position, diverged_at=rollout.diverged_at)
+                meter.count(1, scenarios=1)
+            seconds_per_frame = rollouts.seconds / rollouts.frames
+            writer.label(seconds_per_frame=seconds_per_frame)
+            if time_solver is not None:
+                solver_seconds = time_solver(info.split, info.size)
+            if solver_seconds is not None:
+                writer.label(solver_seconds_per_frame=solver_seconds)
 
-
-def _find_root(
-    split: str | Path | None,
-    trained: Checkpoint,
-    root: str | Path | None,
-    registry: Registry | None,
-) -> Path:
-    """Return the root folder of the data: that of a local split, if one is named.
-
-    Raises:
-        UsageError: the model was trained on another split.
-    """
-    if split is None:
-        return resolve_root(root)
-    location = locate_split(split, root=root, registry=registry)
-    trained_split = trained.info.split
-    if location.name != trained_split:
-        raise UsageError(
-            "the model was trained on another split",
-            where="--split",
-            expected=trained_split,
-            got=location.name,
-            fix="leave it out, or name the folder of the local split of the training",
-        )
-    return location.root
-
-
-def _find_scenarios(
-    info: DatasetInfo, subset: str, root: Path, registry: Registry
-) -> list[Path]:
-    """Return the scenario files of a subset that can be scored.
-
-    Raises:
-        DataError: a file is not there.
-        UsageError: the subset is not scored.
-    """
-    registry.size(info.split, info.size).scored_on(subset)
-    paths = scenario_paths(
-        info.split, subset=subset, size=info.size, root=root, registry=registry
-    )
-    return list(paths.values())
-
-
-def _summarise(
-    rollouts: _TimedRollouts,
-    *,
-    output: Path,
-    trained_size: str,
-    settings: tuple[str, ...],
-    method: str,
-    device: str,
-    solver_seconds_per_frame: float | None,
-) -> PredictionResult:
-    """Return the result of rollouts that were written."""
-    info = rollouts.info
-    seconds = rollouts.seconds_per_frame
-    seconds_without_search = seconds - rollouts.search_per_frame
-    return PredictionResult(
-        path=output,
+    result = PredictionResult(
+        path=output_path,
         split=info.split,
         size=info.size,
-        trained_size=trained_size,
-        settings=settings,
-        method=method,
-        scenarios=len(rollouts.paths),
+        trained_size=trained.info.size,
+        settings=tuple(settings),
+        method=method or model.method,
+        scenarios=len(files),
         frames=info.horizon,
         batch=rollouts.side_by_side,
-        seconds_per_frame=seconds,
-        seconds_without_search=seconds_without_search,
+        seconds_per_frame=seconds_per_frame,
+        seconds_without_search=seconds_per_frame - rollouts.search_per_frame,
         clock=rollouts.clock,
-        wall_seconds_per_frame=rollouts.wall_seconds_per_frame,
+        wall_seconds_per_frame=rollouts.wall_seconds / rollouts.frames,
         threads=rollouts.threads,
         load=read_load(),
-        solver_seconds_per_frame=solver_seconds_per_frame,
-        device=device,
-        parameters=count_parameters(rollouts.model),
+        solver_seconds_per_frame=solver_seconds,
+        device=label,
+        parameters=count_parameters(model),
         diverged=rollouts.diverged,
     )
-
-
-def _write_rollouts(
-    writer: PredictionsWriter,
-    rollouts: _TimedRollouts,
-    info: DatasetInfo,
-    *,
-    time_solver: Callable[[str, str], float | None] | None,
-    progress: Callable[[Progress], None] | None,
-) -> float | None:
-    """Write all rollouts, then their time; return our solver's time for a frame [s]."""
-    count = len(rollouts.paths)
-    meter = Meter(progress)
-    meter.begin("predicting", total=count, scenarios=count)
-    solver_seconds_per_frame = None
-    with writer:
-        for rollout in rollouts:
-            position = rollout.position.numpy()
-            writer.add(rollout.scenario, position, diverged_at=rollout.diverged_at)
-            meter.count(1, scenarios=1)
-        writer.label(seconds_per_frame=rollouts.seconds_per_frame)
-        if time_solver is not None:
-            solver_seconds_per_frame = time_solver(info.split, info.size)
-        if solver_seconds_per_frame is not None:
-            writer.label(solver_seconds_per_frame=solver_seconds_per_frame)
-    return solver_seconds_per_frame
-
-
-def _check_batch(batch: int | None) -> None:
-    """Refuse groups of no scenario.
-
-    Raises:
-        UsageError: fewer than one scenario is to be rolled out side by side.
-    """
-    if batch is not None and batch < 1:
-        raise UsageError(
-            "so few scenarios cannot be predicted together",
-            where="--batch",
-            expected="1 or more",
-            got=batch,
-            fix="leave it out, or give 1 or more",
-        )
-
-
-def _choose_batch(batch: int | None, machine: str, *, scenarios: int) -> int:
-    """Return how many scenarios to roll out side by side."""
-    if batch is None:
-        batch = scenarios
-        if machine == "cpu":
-            batch = 1
-    return min(batch, scenarios)
-
-
-def _describe_hardware(machine: str) -> str:
-    """Return the GPU, or the processor and its threads."""
-    found_hardware = hardware(machine)
-    if machine == "cuda":
-        return str(found_hardware["device"])
-    threads = found_hardware["threads"]
-    unit = "thread"
-    if threads > 1:
-        unit = "threads"
-    return f"{found_hardware['processor']}, {threads} {unit}"
+    values = {**asdict(result), "path": output_path.name}
+    text = json.dumps(values, indent=2, sort_keys=True)
+    costs = costs_path(output_path)
+    write_atomically(costs, text.encode() + b"\n", option="--output")
+    return result
 
 
 def costs_path(output: Path) -> Path:
@@ -356,27 +266,6 @@ def costs_path(output: Path) -> Path:
     if output.suffix.lower() == ".nc":
         return output.with_suffix(".json")
     return output.with_name(f"{output.name}.json")
-
-
-def _write_costs(result: PredictionResult) -> None:
-    """Write the result as JSON beside the predictions."""
-    values = {**asdict(result), "path": result.path.name}
-    text = json.dumps(values, indent=2, sort_keys=True)
-    path = costs_path(result.path)
-    write_atomically(path, text.encode() + b"\n", option="--output")
-
-
-def check_outputs(output: Path, *, overwrite: bool) -> None:
-    """Refuse to write predictions and their costs over files of another kind.
-
-    Raises:
-        UsageError: the output is a folder or a file of another kind, there is such a
-            file, or its name has the ending of another format.
-    """
-    check_predictions_output(output, overwrite=overwrite)
-    costs = costs_path(output)
-    # costs belong to the predictions beside them, and go when these go
-    check_output_file(costs, overwrite=True)
 
 
 class _TimedRollouts:
@@ -409,21 +298,18 @@ class _TimedRollouts:
         self._machine = machine
         # of scenarios whose files state none [length^2/s]
         self._viscosity = viscosity
-        self._groups = []
-        for first in range(0, len(paths), side_by_side):
-            end = first + side_by_side
-            self._groups.append(paths[first:end])
         self._search_seconds: list[float] = []  # per frame of one scenario
 
     def __iter__(self) -> Iterator[Rollout]:
         """Yield the rollout of every scenario."""
         input_frames = slice(0, self.info.input_frames)
-        for number, group in enumerate(self._groups):
+        for first in range(0, len(self.paths), self.side_by_side):
+            group = self.paths[first : first + self.side_by_side]
             given_frames = scenario_batch(
                 group, input_frames, viscosity=self._viscosity
             )
             given_frames = given_frames.to(self._machine)
-            if number == 0:
+            if first == 0:
                 roll_out(self.model, given_frames, 1)  # to warm up
             start_time = self._read_clock()
             wall_start = time.perf_counter()
@@ -431,16 +317,13 @@ class _TimedRollouts:
             self.seconds += self._read_clock() - start_time
             self.wall_seconds += time.perf_counter() - wall_start
             for rollout in rollouts:
-                self._count_frames(rollout)
+                self.frames += count_predicted(
+                    rollout, self.info.horizon, input_frames=self.info.input_frames
+                )
+                if rollout.diverged_at is not None:
+                    self.diverged[rollout.scenario] = rollout.diverged_at
             self._time_searches(given_frames, rollouts)
             yield from rollouts
-
-    def _count_frames(self, rollout: Rollout) -> None:
-        self.frames += count_predicted(
-            rollout, self.info.horizon, input_frames=self.info.input_frames
-        )
-        if rollout.diverged_at is not None:
-            self.diverged[rollout.scenario] = rollout.diverged_at
 
     def _time_searches(self, given: Batch, rollouts: list[Rollout]) -> None:
         """Search neighbours once more in some frames, and take the time."""
@@ -462,16 +345,6 @@ class _TimedRollouts:
             )
             elapsed = self._read_clock() - start_time
             self._search_seconds.append(elapsed / len(rollouts))
-
-    @property
-    def seconds_per_frame(self) -> float:
-        """Time of one frame of one scenario [s]."""
-        return self.seconds / self.frames
-
-    @property
-    def wall_seconds_per_frame(self) -> float:
-        """Time of one frame of one scenario on the wall [s]."""
-        return self.wall_seconds / self.frames
 
     @property
     def search_per_frame(self) -> float:
@@ -528,11 +401,10 @@ def restore_for_size(
         return restore(replace(scaled, options=options), where=where)
     except UnreadableFileError as error:
         raise UsageError(
-            "the weights do not fit the model with these settings",
+            "the weights do not fit the model with these settings: "
+            f"{', '.join(settings)}; set options without weights, or train with these "
+            "settings",
             where="--set",
-            expected="settings that leave the shapes of the weights",
-            got=", ".join(settings),
-            fix="set options without weights, or train with these settings",
         ) from error
 
 

@@ -76,7 +76,18 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     was_training = model.training
     model.eval()
     try:
-        predicted, finite_frames = _advance(model, given, frames)
+        particles, _, dimension = given.position.shape
+        predicted = torch.empty(frames, particles, dimension)
+        finite_frames = frames
+        state = model.start(given)
+        for frame, row in enumerate(predicted):
+            state, position = model.advance(state)
+            row.copy_(position)
+            # The scorer refuses positions farther out. Comparisons with NaN are false.
+            is_near = (row - 0.5).abs() <= MAX_DISTANCE
+            if not is_near.all():
+                finite_frames = frame
+                break
         is_diverged = finite_frames < frames
         if is_diverged and given.windows > 1:
             rollouts = []
@@ -137,57 +148,6 @@ def _rows(values: Tensor | None, rows: slice | Tensor) -> Tensor | None:
     return values[rows]
 
 
-def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
-    """Return positions, and how many of the frames are finite and near the box.
-
-    Positions have shape [frame, particle, axis].
-    """
-    particles, _, dimension = given.position.shape
-    shape = (frames, particles, dimension)
-    predicted = torch.empty(shape, dtype=torch.float32)
-    state = model.start(given)
-    for frame, row in enumerate(predicted):
-        output: object = model.advance(state)
-        state, position = _check_advance(model, output, row.shape)
-        row.copy_(position)
-        # The scorer refuses positions farther out. Comparisons with NaN are false.
-        distance = (row - 0.5).abs()
-        is_near = distance <= MAX_DISTANCE
-        if not is_near.all():
-            return predicted, frame
-    return predicted, frames
-
-
-def _check_advance(
-    model: Baseline, output: object, shape: torch.Size
-) -> tuple[Any, Tensor]:
-    """Return state and positions; refuse other outputs of a stranger's model.
-
-    Positions of another shape could be broadcast to a frame.
-    """
-    if not isinstance(output, tuple | list):
-        output = (output,)
-    if len(output) == 2:
-        state, position = output
-        if isinstance(position, Tensor) and position.shape == shape:
-            return state, position
-    descriptions = []
-    for part in output:
-        description = f"a {type(part).__name__}"
-        if hasattr(part, "shape"):
-            description += f" of shape {list(part.shape)}"
-        descriptions.append(description)
-    raise UsageError(
-        "a model returned no positions of the next frame",
-        where=f"{type(model).__qualname__}.advance",
-        expected=f"the next state and a tensor of shape {list(shape)}: "
-        "[particle, axis]",
-        got=", ".join(descriptions),
-        fix="return both from this method; torch.from_numpy makes a tensor of a NumPy "
-        "array",
-    )
-
-
 @contextmanager
 def replace_parameters(values: Mapping[Tensor, Tensor]) -> Iterator[None]:
     """Give parameters other values for a while."""
@@ -245,10 +205,9 @@ def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWi
         numbers = range(file.header.frames)[frames]
         if not numbers or numbers.step != 1:
             raise UsageError(
-                "no consecutive frames",
+                f"no consecutive frames: got {frames}, expected frames of "
+                f"0:{file.header.frames}",
                 where=str(path),
-                expected=f"frames of 0:{file.header.frames}",
-                got=frames,
             )
         first = numbers.start
         own_frames = slice(first, numbers.stop)
@@ -332,48 +291,34 @@ class Validation:
             stance = torch.compiler.set_stance("force_eager")
 
         tallies: dict[int, Tally] = {}
+        viscosity = self.task.size.viscosity()
+        input_frames = slice(0, self.task.config.input_frames)
+        metrics = select([self.metric])
         with round_parameters(model), stance:
             for group in groups:
-                for rollout in self._roll_out(model, group, device):
-                    tallies[rollout.scenario] = self._compare(rollout)
+                paths = [self.task.truth.path(scenario) for scenario in group]
+                given = scenario_batch(paths, input_frames, viscosity=viscosity)
+                horizon = max(self.frames[scenario] for scenario in group)
+                for rollout in roll_out(model, given.to(device), horizon):
+                    frames = self.task.config.predicted_frames
+                    with self.task.opened(rollout.scenario) as truth:
+                        pairs = _pair_frames(rollout, truth, frames)
+                        statistics = tally(pairs, metrics, frames)
+                    tallies[rollout.scenario] = round_statistics(statistics)
         result = score(METRICS[self.metric], tallies)
         if result is None:
             return math.nan
         return result.mean
 
-    def _roll_out(
-        self, model: Baseline, scenarios: Sequence[int], device: torch.device
-    ) -> list[Rollout]:
-        """Return rollouts of scenarios side by side."""
-        paths = [self.task.truth.path(scenario) for scenario in scenarios]
-        input_frames = slice(0, self.task.config.input_frames)
-        viscosity = self.task.size.viscosity()
-        given_frames = scenario_batch(paths, input_frames, viscosity=viscosity)
-        given_frames = given_frames.to(device)
-        horizon = max(self.frames[scenario] for scenario in scenarios)
-        return roll_out(model, given_frames, horizon)
-
-    def _compare(self, rollout: Rollout) -> Tally:
-        """Return the tally of a rollout against the truth, rounded as in a file."""
-        frames = self.task.config.predicted_frames
-        with self.task.opened(rollout.scenario) as truth:
-            # A generator, so that one pair of frames is in memory at a time.
-            pairs = _pair_frames(rollout, truth, frames)
-            metrics = select([self.metric])
-            statistics = tally(pairs, metrics, frames)
-            return round_statistics(statistics)
-
 
 def _pair_frames(
     rollout: Rollout, truth: OpenScenario, frames: Sequence[int]
 ) -> Iterator[FramePair]:
-    """Yield true and predicted frames."""
+    """Yield true and predicted frames, one pair in memory at a time."""
     scenario = truth.scenario
-    position = rollout.position.numpy()
-    predicted_frames = snapshots(scenario, position)
-    true_frames = truth.snapshots()
+    predicted_frames = snapshots(scenario, rollout.position.numpy())
     for frame, predicted, true in zip(
-        frames, predicted_frames, true_frames, strict=False
+        frames, predicted_frames, truth.snapshots(), strict=False
     ):
         yield FramePair(scenario, frame, true, predicted)
 

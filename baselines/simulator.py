@@ -423,36 +423,29 @@ class GraphNetwork(Baseline):
         self._check_radius()
         if options.noise_spread and options.noise_std == 0.0:
             raise UsageError(
-                "there is no noise to spread",
+                f"there is no noise to spread: model.noise_std={options.noise_std}; "
+                "--set model.noise_std=1e-3, or leave model.noise_spread out",
                 where="model.noise_spread",
-                expected="model.noise_std above 0, the largest deviation",
-                got=f"model.noise_std={options.noise_std}",
-                fix="--set model.noise_std=1e-3, or leave model.noise_spread out",
             )
         if options.compression > 0.0 and options.recovery is None:
             raise UsageError(
-                "displaced particles have no way back to the true path",
+                "displaced particles have no way back to the true path: "
+                "model.recovery=null; --set model.recovery=8, or leave "
+                "model.compression out",
                 where="model.compression",
-                expected="model.recovery, a number of frames",
-                got="model.recovery=null",
-                fix="--set model.recovery=8, or leave model.compression out",
             )
         if options.free_flight is not None and (options.body_force or options.obstacle):
             raise UsageError(
-                "a body in free flight meets no force but gravity",
+                "a body in free flight meets no force but gravity: "
+                f"{options.free_flight}; leave the option out",
                 where="model.free_flight",
-                expected="null, beside model.body_force or model.obstacle",
-                got=options.free_flight,
-                fix="leave the option out",
             )
         self._check_relaxation()
         if options.link_weight is not None and "link" not in self.operator.weights:
             raise UsageError(
-                f"{self.method} predicts no links",
+                f"{self.method} predicts no links: {options.link_weight}; leave the "
+                "option out, or train supergat",
                 where="model.link_weight",
-                expected="null",
-                got=options.link_weight,
-                fix="leave the option out, or train supergat",
             )
 
     def _check_radius(self) -> None:
@@ -466,11 +459,10 @@ class GraphNetwork(Baseline):
         if radius is None or box.allows_radius(radius):
             return
         raise UsageError(
-            "the radius is above half of the shortest period",
+            f"the radius is above half of the shortest period: got {radius}, expected "
+            f"at most {box.largest_radius:g}; set a smaller one; the data set has "
+            f"{self.info.radius:g}",
             where="model.radius",
-            expected=f"at most {box.largest_radius:g}",
-            got=radius,
-            fix=f"set a smaller one; the data set has {self.info.radius:g}",
         )
 
     def _check_relaxation(self) -> None:
@@ -485,19 +477,15 @@ class GraphNetwork(Baseline):
             return
         if not options.clamp:
             raise UsageError(
-                "relaxation keeps particles in the box",
+                "relaxation keeps particles in the box: model.clamp=false; leave one "
+                "of the two out",
                 where="model.relaxation",
-                expected="model.clamp=true beside it",
-                got="model.clamp=false",
-                fix="leave one of the two out",
             )
         if options.neighbours is not None:
             raise UsageError(
-                "relaxation needs all neighbours of a particle",
+                "relaxation needs all neighbours of a particle: "
+                f"model.neighbours={options.neighbours}; leave one of the two out",
                 where="model.relaxation",
-                expected="model.neighbours=null beside it",
-                got=f"model.neighbours={options.neighbours}",
-                fix="leave one of the two out",
             )
 
     def adapt_weights(
@@ -717,11 +705,9 @@ class GraphNetwork(Baseline):
         repeated = terms.keys() & losses.keys()
         if repeated:
             raise UsageError(
-                "an operator's loss has the name of one of ours",
+                "an operator's loss has the name of one of ours: "
+                f"{', '.join(sorted(repeated))}; rename it",
                 where=f"{self.operator.__qualname__}.forward",
-                expected="a name of its own",
-                got=", ".join(sorted(repeated)),
-                fix="rename it",
             )
 
     def _forget(

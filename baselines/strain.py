@@ -104,11 +104,10 @@ def first_frame(given: Batch) -> Tensor:
         return given.origin
     if bool((given.frame != 0).any()):
         raise UsageError(
-            "the model needs the positions in the scenario's first frame",
+            "the model needs the positions in the scenario's first frame: none, in "
+            f"windows from frame {int(given.frame.max())}; make the windows with "
+            "WindowDataset(..., origin=True)",
             where="batch.origin",
-            expected="the positions in it",
-            got=f"none, in windows from frame {int(given.frame.max())}",
-            fix="make the windows with WindowDataset(..., origin=True)",
         )
     return given.position[:, 0]
 

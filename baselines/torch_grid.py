@@ -217,10 +217,9 @@ def _check_shapes(position: Tensor, velocity: Tensor, sample: Tensor | None) -> 
     if sample is not None:
         shapes += f" and sample {tuple(sample.shape)}"
     raise UsageError(
-        "positions, velocities and windows do not fit",
-        expected="two tensors of one shape [..., particle, 2], or [particle, 2] with "
-        "sample [particle]",
-        got=shapes,
+        f"positions, velocities and windows do not fit: {shapes}, expected two "
+        "tensors of one shape [..., particle, 2], or [particle, 2] with sample "
+        "[particle]"
     )
 
 

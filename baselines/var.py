@@ -247,11 +247,8 @@ class StableVAR(Fitted):
         rows = LaggedRows(sequences, lags=1)
         if not rows.rows:
             raise WorkFailedError(
-                "nothing to fit",
+                "nothing to fit; take longer scenarios for train",
                 where="scenarios of train",
-                expected="scenarios of 3 frames or more",
-                got="none",
-                fix="take longer scenarios for train",
             )
         mean, drift, variance = self._moments(rows)
         rank = self.directions.shape[1]
@@ -337,11 +334,8 @@ def solve(blocks: LaggedRows) -> LeastSquares:
     first_block = next(iter(blocks), None)
     if first_block is None:
         raise WorkFailedError(
-            "nothing to fit",
+            "nothing to fit; take longer scenarios for train, or fewer lags",
             where="scenarios of train",
-            expected="scenarios longer than the lags",
-            got="no rows",
-            fix="take longer scenarios for train, or fewer lags",
         )
     x, y = first_block
     regressor_count = x.shape[1]
@@ -361,11 +355,8 @@ def _require_finite(values: Matrix | Frames) -> None:
     if np.isfinite(values).all():
         return
     raise WorkFailedError(
-        "values are not finite",
+        "values are not finite; check the data: lagbench verify",
         where="rows to fit",
-        expected="finite positions",
-        got="NaN or infinite",
-        fix="check the data: lagbench verify",
     )
 
 
@@ -497,11 +488,9 @@ def _factor(
         divide_in_place = partial(divide, overwrite_b=True)
         return divide_in_place, condition, floor
     raise WorkFailedError(
-        "the Gram matrix has no Cholesky factor",
+        "the Gram matrix has no Cholesky factor: a singular matrix; take more or "
+        "longer scenarios for train",
         where="rows to fit",
-        expected="rows that determine a fit",
-        got="a singular matrix",
-        fix="take more or longer scenarios for train",
     )
 
 
