@@ -22,7 +22,7 @@ from lagbench.baselines import predict as prediction
 from lagbench.baselines import runner
 from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find, load_all
-from lagbench.baselines.checkpoint import Checkpoint, load, save
+from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.graph import radius_graph
 from lagbench.baselines.neuralmpm import NeuralMPM
@@ -667,8 +667,6 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
             assert shapes == parameter_shapes(model, small), model.method
 
 
-
-
 def test_the_current_folder_is_not_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -684,8 +682,6 @@ def test_predictions_without_an_ending_have_costs_of_their_own(
     run(name="run-0.6", method="other")
     names = {path.name for path in tmp_path.glob("run-*")}
     assert names == {"run-0.5", "run-0.5.json", "run-0.6", "run-0.6.json"}
-
-
 
 
 def test_predictions_are_not_replaced_in_silence(run: Predict, tmp_path: Path) -> None:
