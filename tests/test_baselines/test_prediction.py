@@ -28,7 +28,6 @@ from lagbench.baselines.graph import radius_graph
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import (
     PredictionResult,
-    check_outputs,
     predict,
 )
 from lagbench.baselines.recipe import recipe_for
@@ -665,14 +664,6 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         if model.any_size:
             shapes = parameter_shapes(model, large)
             assert shapes == parameter_shapes(model, small), model.method
-
-
-def test_the_current_folder_is_not_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UsageError):
-        check_outputs(Path(), overwrite=True)
 
 
 def test_predictions_without_an_ending_have_costs_of_their_own(
