@@ -6,7 +6,6 @@ A recording is a scenario file, or an ``xarray.Dataset`` of one scenario as
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -239,24 +238,12 @@ class Recording:
         Raises:
             UsageError: the scenario has no such frame.
         """
-        try:
-            number = operator.index(frame)
-        except TypeError:
-            what = "a frame is named by a whole number"
-            raise self._no_frame(what, got=repr(frame)) from None
-        if not -self.frames <= number < self.frames:
-            raise self._no_frame(f"no frame {number}", got=number)
-        return number % self.frames
-
-    def _no_frame(self, what: str, *, got: object) -> UsageError:
-        return UsageError(
-            what,
-            where=f"scenario {self.scenario}",
-            expected=f"0 to {self.frames - 1}, or -{self.frames} to -1",
-            got=got,
-            fix="name a frame in this range; negative numbers count from the end, "
-            "and -1 is the last frame",
-        )
+        if not -self.frames <= frame < self.frames:
+            raise UsageError(
+                f"scenario {self.scenario} has no frame {frame}; name one from 0 to "
+                f"{self.frames - 1}, or from -{self.frames} to -1"
+            )
+        return frame % self.frames
 
     def scene(self, frame: int) -> Scene:
         """Return one frame; negative numbers count from the end.
@@ -268,11 +255,8 @@ class Recording:
         number = self.frame_number(frame)
         if self.frames == 1 and not self._has_velocity:
             raise UsageError(
-                "nothing says how the particles move",
-                where=f"scenario {self.scenario}",
-                expected="two frames, or velocities",
-                got="one frame without velocities",
-                fix="draw a scenario of more frames",
+                f"scenario {self.scenario} has one frame without velocities: nothing "
+                "says how its particles move; draw one of more frames"
             )
         position = self._read_particles("position", number)
         interval = self.size.frame_interval
@@ -348,11 +332,8 @@ def _record_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
     """Return the recording that a data set of one scenario holds."""
     if "scenario" in data.dims:
         raise UsageError(
-            "a picture shows one scenario",
-            where="the data set that is drawn",
-            expected="one scenario",
-            got=f"{data.sizes['scenario']} scenarios",
-            fix="choose one: data.sel(scenario=3)",
+            f"a picture shows one scenario, not {data.sizes['scenario']}; choose one, "
+            "as in data.sel(scenario=3)"
         )
     attributes: dict[str, Any] = {str(name): v for name, v in data.attrs.items()}
     _require_complete(data)
@@ -396,40 +377,20 @@ def _require_complete(data: xr.Dataset) -> None:
             missing.append(f"variable {name}")
     if missing:
         raise UsageError(
-            "the data set lacks what a picture needs",
-            where="the data set that is drawn",
-            expected=f"attributes {', '.join(IDENTITY)}; variables "
-            f"{', '.join(DRAWN_VARIABLES)}",
-            got=f"no {', no '.join(missing)}",
-            fix="keep all variables and attributes of a scenario, as "
-            "xr.set_options(keep_attrs=True) does",
+            f"the data set has no {', no '.join(missing)}; keep all variables and "
+            "attributes of a scenario, as xr.set_options(keep_attrs=True) does"
         )
 
 
 def _count_frames(data: xr.Dataset) -> int:
     """Return how many frames a data set of one scenario has; padding does not count."""
-    if "frame" in data.dims:
-        numbers = data["frame"].values.tolist()
-    else:
-        numbers = []
+    numbers = data["frame"].values.tolist() if "frame" in data.dims else []
+    frame_count = len(numbers)
     if "frame_count" in data:
         frame_count = int(data["frame_count"])
-    else:
-        frame_count = len(numbers)
-
-    expected = max(frame_count, len(numbers), 1)
-    if numbers != list(range(expected)):
-        if numbers:
-            first = ", ".join(map(str, numbers[:3]))
-            got = f"{len(numbers)}: {first}, ..."
-        else:
-            got = "no dimension frame"
+    if numbers != list(range(max(frame_count, len(numbers), 1))):
         raise UsageError(
-            "a picture needs all frames of a scenario, because a number names a frame",
-            where="coordinate frame",
-            expected=f"0, 1, 2, ... to {expected - 1}",
-            got=got,
-            fix="choose a scenario only, data.sel(scenario=3), and say which "
-            "frame to draw",
+            "a picture needs all frames of a scenario, from 0 on; choose a scenario "
+            "only, as in data.sel(scenario=3), and say which frame to draw"
         )
     return frame_count

@@ -72,9 +72,8 @@ def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
         )
     with open_split("fluid", subset="train", size="tiny", root=tmp_path) as data:
         part = data.isel(scenario=0, frame=CUTS[cut])
-        with pytest.raises(UsageError) as caught:
+        with pytest.raises(UsageError):
             draw_frame(part, 0)
-    assert caught.value.where == "coordinate frame"
 
 
 @pytest.mark.parametrize("frame", [0, 3])
