@@ -8,7 +8,6 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.addresses import ARCHIVES, describe
 from lagbench.data.layout import (
     MANIFEST_NAME,
     format_ids,
@@ -29,7 +28,7 @@ from lagbench.data.manifest import (
     write_manifest,
 )
 from lagbench.data.registry import Registry, Size, Split
-from lagbench.errors import DataError, UsageError, WorkFailedError, hide_credentials
+from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
 from lagbench.make.inventory import (
@@ -44,16 +43,15 @@ from lagbench.store.archive import (
     list_releases,
 )
 from lagbench.store.copy import object_address, parse_manifest, refuse_foreign_hashes
-from lagbench.store.fetch import CONNECTIONS, FetchRequest, fetch_scenarios, fetch_text
+from lagbench.store.fetch import CONNECTIONS, FetchRequest, fetch_scenarios
 from lagbench.store.objects import (
     NotInStoreError,
     StoreUnreachableError,
     check_address,
+    read_object,
 )
 from lagbench.store.publication import Publication, publish
 from lagbench.work.run import Meter, Progress
-
-HINT = "try again; if it stays so, name another store: --from"
 
 Reason = DataError | WorkFailedError | UsageError
 """Why something could not be downloaded."""
@@ -126,7 +124,8 @@ def download(
             answers or is fast enough and nothing may be simulated.
     """
     started = time.monotonic()
-    _check_connections(connections)
+    if connections < 1:
+        raise UsageError("a download needs a connection", where="--connections")
     tier, data_root, rooted_registry = locate_new(
         split, size, root=root, registry=registry
     )
@@ -197,17 +196,6 @@ def download(
     )
 
 
-def _check_connections(count: int) -> None:
-    if count < 1:
-        raise UsageError(
-            "a download needs a connection",
-            where="--connections",
-            expected="1 or more",
-            got=count,
-            fix="leave it out, or give a larger number",
-        )
-
-
 def _list_stores(mirror: str | None, split: Split, size: Size) -> list[str]:
     """Return the URLs of stores in the order in which they are asked.
 
@@ -245,10 +233,7 @@ def _describe_data(
 
 def _describe_fallback(reason: Reason, scenarios: Sequence[int]) -> str:
     """Return the sentence that says why scenarios are simulated."""
-    place = ""
-    if reason.where:
-        place = f" ({reason.where})"
-    return f"{reason.what}{place}: simulating scenarios {format_ids(scenarios)}"
+    return f"{reason}: simulating scenarios {format_ids(scenarios)}"
 
 
 def _total_length(requests: Iterable[FetchRequest]) -> int:
@@ -343,22 +328,14 @@ class DownloadJob:
                 unknown.append(scenario)
         if unknown:
             return DataError(
-                "no hash is recorded to check downloads against",
-                where=f"{place}, scenarios {format_ids(unknown)}",
-                expected=f"their hashes in {self.size.record_name}",
-                got="none",
-                fix=suggest_repair(self.size),
+                f"no hash of scenarios {format_ids(unknown)} is recorded to check "
+                f"downloads against; {suggest_repair(self.size)}",
+                where=place,
             )
-        archives = None
-        if self.size.simulated:
-            archives = f"the address of released archives: {describe(ARCHIVES)}"
         reason: Reason = UsageError(
-            "no store is known to download from",
+            "no store is known to download from; name one: --from URL, or "
+            f"{RELEASES_VARIABLE}=URL; or leave out --no-generate",
             where=place,
-            expected="a store, or a folder of released archives",
-            got=archives,
-            fix=f"name one: --from URL, or {RELEASES_VARIABLE}=URL; or leave out "
-            f"--no-generate",
         )
         for url in urls:
             if not self.missing:
@@ -403,19 +380,17 @@ class DownloadJob:
         """
         place = object_address(self.size, url, MANIFEST_NAME)
         try:
-            text = fetch_text(place, limit=MANIFEST_LIMIT, hint=HINT)
+            text = read_object(place, limit=MANIFEST_LIMIT)
         except NotInStoreError:
             return None
-        manifest = parse_manifest(self.size, text, where=place, hint=HINT)
+        manifest = parse_manifest(self.size, text, where=place)
         claims = {entry.scenario: entry for entry in manifest.files}
         foreign_scenarios = []
         for scenario in self.missing:
             claim = claims.get(scenario)
             if claim and not claim.has_hash(self._recorded_hashes[scenario]):
                 foreign_scenarios.append(scenario)
-        refuse_foreign_hashes(
-            self.size, manifest, foreign_scenarios, where=place, hint=HINT
-        )
+        refuse_foreign_hashes(self.size, manifest, foreign_scenarios, where=place)
         return claims
 
     def _list_requests(
@@ -433,22 +408,12 @@ class DownloadJob:
                 content_sha256=self._recorded_hashes[scenario],
                 length=claim.bytes if claim else None,
                 file_sha256=claim.file_sha256 if claim else None,
-                hint=HINT,
             )
         return requests
 
     def _fetch_archive(self, url: str, requests: Mapping[int, FetchRequest]) -> bool:
         """Take files from the archive of the data set; return whether there is one."""
-        longest_files = map(self.size.longest_file, self.size.scenarios)
-        archive = fetch_archive(
-            self.size,
-            url,
-            requests,
-            self._count_bytes,
-            meter=self._meter,
-            limit=sum(longest_files) + MANIFEST_LIMIT,
-            hint=HINT,
-        )
+        archive = fetch_archive(self.size, url, requests, self._count_bytes)
         try:
             with closing(archive) as arrived_entries:
                 for entry in arrived_entries:
@@ -491,7 +456,7 @@ class DownloadJob:
             entry = entry.model_copy(update=update)
         self._entries.append(entry)
         self.downloaded.append(scenario)
-        self.url = hide_credentials(url)
+        self.url = url
         self._meter.count(scenarios=1)
 
     def _count_bytes(self, byte_count: int) -> None:

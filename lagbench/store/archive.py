@@ -4,21 +4,22 @@
 
 writes ``dist/cavity-mini-<first 16 digits of the data set hash>.tar``: the manifest,
 then the scenario files in the order of their names, not compressed (they are already).
-The same files give the same bytes. Files from an archive are checked like single ones;
-a member that should not be there is an error.
+The same files give the same bytes. Files from an archive are checked like single ones.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import sys
 import tarfile
+import tempfile
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
+from typing import IO
 
 from lagbench.addresses import ARCHIVES
 from lagbench.atomic import atomic_path
@@ -33,28 +34,10 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, LagbenchError
-from lagbench.work.run import Meter
 
 from .copy import parse_manifest, refuse_foreign_hashes, update_working_copy
-from .fetch import (
-    BLOCK,
-    FetchRequest,
-    TransferRate,
-    accept,
-    partial_file_errors,
-    partial_name,
-    receive,
-    retry,
-)
-from .objects import (
-    Answer,
-    BrokenError,
-    NotDataError,
-    TruncatedError,
-    WrongContentError,
-    WrongLengthError,
-    open_object,
-)
+from .fetch import FetchRequest, accept, partial_name
+from .objects import WrongContentError, download_object
 
 RELEASES_VARIABLE = "LAGBENCH_RELEASES"
 """Environment variable that names another folder of released archives."""
@@ -75,11 +58,9 @@ def archive_name(size: Size) -> str:
     """Return the name of the archive of a data set whose hash is recorded."""
     if size.measured is None:
         raise DataError(
-            "a data set without a recorded hash has no archive",
+            "a data set without a recorded hash has no archive; record it: python -m "
+            "lagbench.generators.record",
             where=f"{size.split} {size.name}",
-            expected="a hash in datasets.yaml",
-            got="none",
-            fix="record it: python -m lagbench.generators.record",
         )
     return f"{size.split}-{size.name}-{size.measured.dataset_sha256[:16]}.tar"
 
@@ -139,28 +120,23 @@ def _read_complete_manifest(size: Size, root: Path) -> Manifest:
         if missing:
             got += f"; missing: {format_ids(sorted(missing))}"
         raise DataError(
-            "the data set is not complete, or has other scenarios",
+            f"the data set is not complete, or has other scenarios: got {got}, "
+            f"expected a manifest with scenarios {format_ids(size.scenarios)}; "
+            f"{suggest_repair(size, root=root)}",
             where=where,
-            expected=f"a manifest with scenarios {format_ids(size.scenarios)}",
-            got=got,
-            fix=suggest_repair(size, root=root),
         )
     if size.measured is None:
         raise DataError(
-            "the hash of the data set is not recorded",
+            "the hash of the data set is not recorded; record the data set first: "
+            "docs/extending.md",
             where=f"{size.record_name}, {size.split} {size.name}",
-            expected="a data set hash",
-            got="none",
-            fix="record the data set first: docs/extending.md",
         )
     recorded_hash = size.measured.dataset_sha256
     if manifest.dataset_sha256 != recorded_hash:
         raise DataError(
-            "the data set has another hash",
+            f"the data set has another hash: got {manifest.dataset_sha256}, expected "
+            f"data set hash {recorded_hash}; {suggest_repair(size, root=root)}",
             where=where,
-            expected=f"data set hash {recorded_hash}",
-            got=manifest.dataset_sha256,
-            fix=suggest_repair(size, root=root),
         )
     return manifest
 
@@ -170,26 +146,16 @@ def fetch_archive(
     url: str,
     requests: Mapping[int, FetchRequest],
     report: Callable[[int], None],
-    *,
-    meter: Meter,
-    limit: int,
-    hint: str,
 ) -> Generator[FileEntry, None, None]:
     """Fetch scenarios from the archive in a store; yield the entry of each right file.
 
-    The caller holds the lock of the data set. Other members are skipped. Right files
-    stay, whatever comes after.
+    The caller holds the lock of the data set. Right files stay, whatever comes after.
 
     Args:
         size: the data set.
         url: folder of the archive.
         requests: files to fetch, by scenario id.
-        report: receives the number of bytes that arrived. It counts all members,
-            also those that are read only to reach a later one.
-        meter: begins a stage once the manifest tells the lengths of the requested
-            files, and counts their bytes. The caller counts the files.
-        limit: most bytes of an archive.
-        hint: how the user mends a store with wrong data.
+        report: receives the number of bytes that arrived.
 
     Raises:
         NotInStoreError: the store has no such archive.
@@ -197,222 +163,65 @@ def fetch_archive(
             member.
     """
     address = f"{url}/{archive_name(size)}"
-    missing = set(requests)
-    with closing(_Stream(address, report, limit=limit, hint=hint)) as stream:
-        manifest = _fetch_manifest(size, stream, address, hint)
-        byte_count = 0
-        for entry in manifest.files:
-            if entry.scenario in requests:
-                byte_count += entry.bytes
-        meter.begin("downloading", total=byte_count, scenarios=len(requests))
-        for entry in sorted(manifest.files, key=ARCHIVE_ORDER):
-            if not missing:
-                return
-            padding = -entry.bytes % tarfile.BLOCKSIZE
-            if entry.scenario not in missing:
-                stream.skip(tarfile.BLOCKSIZE + entry.bytes + padding)
-                continue
-            request = replace(
-                requests[entry.scenario], url=address, file_sha256=entry.file_sha256
-            )
-            _fetch_member(stream, entry, request, meter)
-            missing.remove(entry.scenario)
-            yield entry
-            stream.skip(padding)
-        stream.end()
+    longest_files = map(size.longest_file, size.scenarios)
+    limit = sum(longest_files) + MANIFEST_LIMIT + (len(size.scenarios) + 20) * 1024
+    folders = {request.target.parents[1] for request in requests.values()}
+    (folder,) = folders
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".download-") as temporary:
+        path = Path(temporary) / "archive.tar"
+        download_object(address, path, limit=limit, report=report)
+        try:
+            with tarfile.open(path, "r:") as archive:
+                yield from _take_members(size, archive, address, requests)
+        except (tarfile.TarError, KeyError) as error:
+            raise WrongContentError(
+                f"the archive is damaged or lacks a member ({error})", where=address
+            ) from error
 
 
-def _fetch_manifest(size: Size, stream: _Stream, address: str, hint: str) -> Manifest:
-    """Return the manifest, the first member; refuse one of another data set."""
-    length = stream.member(MANIFEST_NAME)
-    if length > MANIFEST_LIMIT:
-        raise stream.error(
-            WrongLengthError, "the manifest is too long", f"{MANIFEST_LIMIT} bytes"
-        )
-    manifest = parse_manifest(size, stream.read(length), where=address, hint=hint)
-    stream.skip(-length % tarfile.BLOCKSIZE)
-
+def _take_members(
+    size: Size,
+    archive: tarfile.TarFile,
+    address: str,
+    requests: Mapping[int, FetchRequest],
+) -> Iterator[FileEntry]:
+    """Write the requested members under their names once they are right."""
+    with _member(archive, MANIFEST_NAME, MANIFEST_LIMIT) as stream:
+        manifest = parse_manifest(size, stream.read(), where=address)
     recorded_hashes: Mapping[int, str] = {}
     if size.measured is not None:
         recorded_hashes = size.measured.scenario_sha256
-    scenarios = []
     foreign_scenarios = []
     for entry in manifest.files:
-        scenarios.append(entry.scenario)
         if not entry.has_hash(recorded_hashes.get(entry.scenario)):
             foreign_scenarios.append(entry.scenario)
-    if sorted(scenarios) != list(size.scenarios):
-        foreign_scenarios = scenarios
-    refuse_foreign_hashes(size, manifest, foreign_scenarios, where=address, hint=hint)
-    return manifest
+    refuse_foreign_hashes(size, manifest, foreign_scenarios, where=address)
 
-
-def _fetch_member(
-    stream: _Stream, entry: FileEntry, request: FetchRequest, meter: Meter
-) -> None:
-    length = stream.member(entry.path)
-    if length != entry.bytes or length > request.limit:
-        raise stream.error(
-            WrongLengthError,
-            f"{entry.path} has another length",
-            f"{min(entry.bytes, request.limit)} bytes",
-        )
-    partial = partial_name(request.target)
-    with partial_file_errors(partial):
-        with partial.open("wb") as file:
-
-            def write(block: bytes) -> None:
-                file.write(block)
-                meter.count(len(block))
-
-            stream.copy(length, write)
-        accept(request)
-
-
-class _Stream:
-    """The bytes of an archive in order; a broken connection is opened again.
-
-    Skipped bytes are not sent where the store knows ranges.
-    """
-
-    def __init__(
-        self, url: str, report: Callable[[int], None], *, limit: int, hint: str
-    ) -> None:
-        self._url = url
-        self._report = report
-        self._limit = limit
-        self._hint = hint
-        self._rate = TransferRate(url)
-        self._position = 0
-        self._knows_ranges = True
-        self._answer: Answer | None = None
-        self._blocks: Iterator[bytes] = iter(())
-        self._unread = b""  # bytes that have arrived, from the present position on
-
-    def error(
-        self, kind: type[DataError], what: str, expected: object, got: object = None
-    ) -> DataError:
-        """Return the error that the archive is wrong."""
-        return kind(what, where=self._url, expected=expected, got=got, fix=self._hint)
-
-    def member(self, name: str) -> int:
-        """Read the header of the next member; return its length.
-
-        Raises:
-            DataError: the next member is not this file.
-        """
-        header = self.read(tarfile.BLOCKSIZE)
+    entries = {entry.scenario: entry for entry in manifest.files}
+    for scenario, request in requests.items():
+        entry = entries[scenario]
+        partial = partial_name(request.target)
+        partial.parent.mkdir(exist_ok=True)
         try:
-            member = tarfile.TarInfo.frombuf(header, "ascii", "strict")
-        except (tarfile.HeaderError, ValueError) as error:
-            raise self.error(
-                NotDataError, "a member has no header", name, error
-            ) from None
-        if member.name != name or not member.isreg() or member.size < 0:
-            raise self.error(
-                WrongContentError,
-                "the archive holds another member",
-                name,
-                f"{member.name!a}, type {member.type!a}",
-            )
-        return member.size
+            with (
+                _member(archive, entry.path, request.limit) as stream,
+                partial.open("wb") as file,
+            ):
+                shutil.copyfileobj(stream, file)
+            accept(replace(request, url=address, file_sha256=entry.file_sha256))
+        finally:
+            partial.unlink(missing_ok=True)
+        yield entry
 
-    def read(self, count: int) -> bytes:
-        """Return the next bytes."""
-        parts: list[bytes] = []
-        self.copy(count, parts.append)
-        return b"".join(parts)
 
-    def copy(self, count: int, write: Callable[[bytes], object]) -> None:
-        """Give the next bytes to a function."""
-        end = self._position + count
-
-        def attempt() -> None:
-            while self._position < end:
-                block = self._next_block()
-                if not block:
-                    raise self.error(
-                        TruncatedError,
-                        "an archive ends too early",
-                        f"over {end - 1}",
-                        f"{self._position} bytes",
-                    )
-                needed_bytes = end - self._position
-                part = block[:needed_bytes]
-                self._unread = block[needed_bytes:]
-                self._position += len(part)
-                write(part)
-
-        retry(attempt, self._url, place=lambda: self._position)
-
-    def skip(self, count: int) -> None:
-        """Pass over bytes."""
-        if self._knows_ranges and count > BLOCK:
-            self.close()
-            self._position += count
-        else:
-            self.copy(count, len)
-
-    def end(self) -> None:
-        """Read to the end; refuse anything but zeros."""
-        block = retry(self._next_block, self._url)
-        while block:
-            self._unread = b""
-            if any(block):
-                raise self.error(
-                    WrongContentError, "the archive holds another member", "its end"
-                )
-            self._position += len(block)
-            block = retry(self._next_block, self._url)
-
-    def close(self) -> None:
-        """Close the connection."""
-        if self._answer is not None:
-            self._answer.close()
-        self._answer = None
-        self._unread = b""
-
-    def _next_block(self) -> bytes:
-        """Return a block from the present position on; an empty one at the end.
-
-        The connection is opened where it is not open.
-        """
-        if self._unread:
-            return self._unread
-        try:
-            if self._answer is None:
-                self._open()
-            return self._unread or self._receive_block()
-        except BrokenError as broken:
-            self.close()
-            if broken.stale:
-                raise broken.error from None
-            raise
-
-    def _open(self) -> None:
-        """Open the connection and pass over bytes before the present position."""
-        self._answer = open_object(self._url, self._position, hint=self._hint)
-        bytes_before = self._position - self._answer.start
-        self._knows_ranges = bytes_before == 0
-        self._blocks = receive(
-            self._answer,
-            self._rate,
-            limit=self._limit,
-            begins=MANIFEST_NAME.encode() + b"\0",
-            hint=self._hint,
-        )
-        while bytes_before > 0:
-            block = next(self._blocks, b"")
-            if not block:
-                return
-            self._unread = block[bytes_before:]
-            self._report(len(self._unread))
-            bytes_before -= len(block)
-
-    def _receive_block(self) -> bytes:
-        block = next(self._blocks, b"")
-        self._report(len(block))
-        return block
+def _member(archive: tarfile.TarFile, name: str, limit: int) -> IO[bytes]:
+    """Open a regular member of at most so many bytes."""
+    member = archive.getmember(name)
+    stream = archive.extractfile(member) if member.isreg() else None
+    if stream is None or member.size > limit:
+        raise tarfile.TarError(f"{name} is no file of at most {limit} bytes")
+    return stream
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -19,7 +18,6 @@ from pydantic import ValidationError
 
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
-from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.layout import MANIFEST_NAME, format_ids, has_file, url_of
 from lagbench.data.local import suggest_repair
 from lagbench.data.lock import dataset_lock
@@ -35,25 +33,17 @@ from lagbench.data.manifest import (
 )
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
-from lagbench.errors import (
-    DataError,
-    UsageError,
-    format_count,
-    hide_credentials,
-    suggest_name,
-)
+from lagbench.errors import DataError, UsageError, suggest_name
 from lagbench.work.machine import may_differ
-from lagbench.work.run import watched
 
-from .fetch import FetchRequest, fetch_scenarios, fetch_text
+from .fetch import FetchRequest, fetch_scenarios
 from .objects import (
     HTTP,
-    NotDataError,
     NotInStoreError,
     Objects,
     WrongContentError,
-    WrongLengthError,
     check_bucket,
+    read_object,
 )
 
 FRESH_SECONDS = 30.0
@@ -76,66 +66,37 @@ def store_folder(size: Size) -> str:
     return size.folder(Path()).as_posix()
 
 
-def _store_hint(size: Size, url: str) -> str:
-    if url.startswith(HTTP):
-        return "tell whoever serves the address, or name another --root"
-    command = f"lagbench generate --split {size.split} --size {size.name} --root {url}"
-    return f"{command} writes it anew"
-
-
-def parse_manifest(size: Size, text: bytes, *, where: str, hint: str) -> Manifest:
+def parse_manifest(size: Size, text: bytes, *, where: str) -> Manifest:
     """Return a store's manifest.
 
     Raises:
-        NotDataError: the text is no manifest, or that of another data set.
+        WrongContentError: the text is no manifest, or that of another data set.
     """
     try:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
-        place = where
-        expected = "a manifest.json as lagbench generate writes it"
-        got = ascii(text[:80].decode("utf-8", "replace"))
-        first_error = error.errors()[0]
-        key = ".".join(str(part) for part in first_error["loc"])
-        if key:
-            place = f"{where}, key {key[:200]!a}"
-            expected = f"{expected}, here {describe_expectation(first_error)}"
-            got = describe_input(first_error)
-        raise NotDataError(
-            "the store's manifest.json is no manifest of lagbench",
-            where=place,
-            expected=expected,
-            got=got,
-            fix=hint,
+        raise WrongContentError(
+            f"the store's manifest.json is no manifest of lagbench: {error}",
+            where=where,
         ) from error
     if not manifest.is_of(size.split, size.name, size.major):
-        names = f"{manifest.split} {manifest.size}, version {manifest.version}"
-        raise NotDataError(
-            "the store's manifest is of another data set",
+        raise WrongContentError(
+            f"the store's manifest is not of {size.split} {size.name}, version "
+            f"{size.major}",
             where=where,
-            expected=f"{size.split} {size.name}, version {size.major}",
-            got=ascii(names[:200]),
-            fix=hint,
         )
     return manifest
 
 
 def refuse_foreign_hashes(
-    size: Size,
-    manifest: Manifest,
-    foreign_scenarios: Collection[int],
-    *,
-    where: str,
-    hint: str,
+    size: Size, manifest: Manifest, foreign_scenarios: Collection[int], *, where: str
 ) -> None:
     """Refuse a store whose manifest has other content hashes than the record."""
     if foreign_scenarios:
         raise WrongContentError(
-            "the store holds another data set",
-            where=f"{where}, scenarios {format_ids(foreign_scenarios)}",
-            expected=f"the content hashes in {size.record_name}",
-            got=f"version {manifest.version}, data set hash {manifest.dataset_sha256}",
-            fix=hint,
+            f"scenarios {format_ids(foreign_scenarios)} of the store have other hashes "
+            f"than {size.record_name}; name another store",
+            where=where,
         )
 
 
@@ -150,11 +111,8 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
     for subset in subsets:
         if not isinstance(subset, str) or subset not in size.subsets:
             raise UsageError(
-                f"no subset {subset!r}",
+                f"no subset {subset!r}; {suggest_name(str(subset), size.subsets)}",
                 where=f"{size.split} {size.name}",
-                expected=", ".join(size.subsets),
-                got=ascii(subset),
-                fix=suggest_name(str(subset), size.subsets),
             )
         for scenario in size.subsets[subset]:
             paths[scenario] = size.path(root, scenario)
@@ -175,11 +133,10 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
             # whoever trains will need the other subsets too
             options = []
         raise DataError(
-            f"{len(missing)} of {len(paths)} scenarios are not there",
+            f"{len(missing)} of {len(paths)} scenarios are not there "
+            f"({format_ids(missing)} of {names}); "
+            f"{suggest_repair(size, *options, root=root)}",
             where=str(size.folder(root)),
-            expected="all scenarios of these subsets",
-            got=f"missing: {format_ids(missing)} of {names}",
-            fix=suggest_repair(size, *options, root=root),
         )
     return paths
 
@@ -232,7 +189,6 @@ def update_working_copy(
         manifest,
         foreign_scenarios,
         where=object_address(size, url, MANIFEST_NAME),
-        hint=_store_hint(size, url),
     )
 
     local_manifest = read_or_empty(size, root)
@@ -269,14 +225,16 @@ def _check_objects(size: Size, url: str, manifest: Manifest) -> None:
         if lengths.get(entry.path) != entry.bytes:
             wrong_scenarios.append(entry.scenario)
     if wrong_scenarios:
-        address = object_address(size, url, MANIFEST_NAME)
         raise DataError(
-            "the store lacks objects of its manifest, or they have another length",
-            where=f"{address}, scenarios {format_ids(wrong_scenarios)}",
-            expected="the lengths that the manifest states",
-            got="other objects",
-            fix=_store_hint(size, url),
+            f"the store lacks scenarios {format_ids(wrong_scenarios)} of its manifest, "
+            f"or they have another length; {_rewriting(size, url)}",
+            where=object_address(size, url, MANIFEST_NAME),
         )
+
+
+def _rewriting(size: Size, url: str) -> str:
+    """Return what writes a data set of a store anew."""
+    return f"lagbench generate --split {size.split} --size {size.name} --root {url}"
 
 
 def _list_lacking(
@@ -305,14 +263,13 @@ def remote_manifest(
         answered, manifest = _manifests[address]
         if time.monotonic() - answered < fresh:
             return manifest
-    hint = _store_hint(size, url)
     manifest = None
     try:
-        text = fetch_text(address, limit=MANIFEST_LIMIT, hint=hint)
+        text = read_object(address, limit=MANIFEST_LIMIT)
     except NotInStoreError:
         check_bucket(url)
     else:
-        manifest = parse_manifest(size, text, where=address, hint=hint)
+        manifest = parse_manifest(size, text, where=address)
     _manifests[address] = (time.monotonic(), manifest)
     return manifest
 
@@ -420,45 +377,25 @@ def fetch_entries(
     """
     if not entries:
         return
-    _check_entry_lengths(size, url, entries)
-    folder = size.folder(root)
     requests = {}
     for entry in entries:
+        if entry.bytes > size.longest_file(entry.scenario):
+            raise WrongContentError(
+                f"scenario {entry.scenario} has an impossible length in the manifest",
+                where=object_address(size, url, MANIFEST_NAME),
+            )
         requests[entry.scenario] = FetchRequest(
             url=object_address(size, url, entry.path),
-            target=folder / entry.path,
+            target=size.folder(root) / entry.path,
             limit=entry.bytes,
             length=entry.bytes,
             file_sha256=entry.file_sha256,
             content_sha256=entry.content_sha256,
-            hint=_store_hint(size, url),
         )
-    total_bytes = sum(entry.bytes for entry in entries)
-    with (
-        _TransferDisplay(url, len(entries), total_bytes) as display,
-        contextlib.closing(fetch_scenarios(requests, display.count)) as arrivals,
-    ):
+    with contextlib.closing(fetch_scenarios(requests, lambda _: None)) as arrivals:
         for _, error in arrivals:
             if error is not None:
                 raise error
-            display.finished_objects += 1
-
-
-def _check_entry_lengths(size: Size, url: str, entries: Iterable[FileEntry]) -> None:
-    """Refuse a manifest that names longer files than there can be."""
-    too_long = []
-    for entry in entries:
-        if entry.bytes > size.longest_file(entry.scenario):
-            too_long.append(entry)
-    if too_long:
-        ids = format_ids(entry.scenario for entry in too_long)
-        raise WrongLengthError(
-            "the store's manifest states impossible lengths of files",
-            where=f"{object_address(size, url, MANIFEST_NAME)}, scenarios {ids}",
-            expected=f"at most {size.longest_file(too_long[0].scenario)} bytes",
-            got=too_long[0].bytes,
-            fix=_store_hint(size, url),
-        )
 
 
 # --- other root folders ---------------------------------------------------------------
@@ -578,16 +515,10 @@ def _require_other_folder(size: Size, root: Path, source: Path) -> None:
 
 def _refuse_source(size: Size, source: Path, *, got: str) -> UsageError:
     return UsageError(
-        "nothing can be gathered from a folder",
+        f"nothing of {size.split} {size.name} can be gathered there: {got}; name the "
+        "--root of another call of lagbench generate",
         where=str(source),
-        expected=f"a root folder with {size.split} {size.name} of another call of "
-        f"lagbench generate",
-        got=got,
-        fix="name the --root of that call: --gather FOLDER",
     )
-
-
-# --- fetching, as others see it -------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -602,41 +533,3 @@ def suspend_fetching(root: Path) -> Iterator[None]:
     finally:
         _copies_of_writers.remove(root)
         _manifests.clear()
-
-
-class _TransferDisplay:
-    """Prints on a terminal how much has been fetched."""
-
-    def __init__(self, url: str, object_count: int, total_bytes: int) -> None:
-        self._url = hide_credentials(url)
-        self._object_count = object_count
-        self._total_bytes = total_bytes
-        self.finished_objects = 0
-        self._arrived_bytes = 0
-        self._last_print = 0.0
-        self._is_visible = watched()
-
-    def __enter__(self) -> _TransferDisplay:
-        self._print()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._print(end="\n")
-
-    def count(self, byte_count: int) -> None:
-        """Count bytes."""
-        self._arrived_bytes += byte_count
-        if time.monotonic() - self._last_print > 0.2:
-            self._print()
-
-    def _print(self, end: str = "") -> None:
-        self._last_print = time.monotonic()
-        if not self._is_visible:
-            return
-        count = format_count(self._object_count, "file")
-        files = f"{self.finished_objects} of {count}"
-        arrived = f"{self._arrived_bytes / 1e6:.1f}"
-        megabytes = f"{arrived} of {self._total_bytes / 1e6:.1f} MB"
-        text = f"lagbench: fetching from {self._url}: {files}, {megabytes}"
-        sys.stderr.write(f"\r{text} {end}")
-        sys.stderr.flush()

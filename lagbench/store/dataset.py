@@ -61,11 +61,8 @@ def load_manifest(
     manifest = read_manifest(root_folder, tier.split, tier.name, tier.major)
     if manifest is None:
         raise DataError(
-            "the data set has no manifest",
+            f"the data set has no manifest; {suggest_repair(tier, root=root_folder)}",
             where=str(tier.folder(root_folder)),
-            expected="manifest.json beside the scenarios",
-            got="none",
-            fix=suggest_repair(tier, root=root_folder),
         )
     return manifest
 
@@ -125,11 +122,10 @@ def open_split(
             joined = _join_scenarios(scenarios, list(paths))
         except (ValueError, TypeError) as error:
             raise DataError(
-                "scenario files do not fit together",
+                "scenario files do not fit together: "
+                f"{f'{type(error).__name__}: {error}'[:MOST_LETTERS]}; lagbench "
+                f"verify names wrong files; {hint}",
                 where=str(tier.folder(root_folder)),
-                expected="variables of the same kinds in all of them",
-                got=f"{type(error).__name__}: {error}"[:MOST_LETTERS],
-                fix=f"lagbench verify names wrong files; {hint}",
             ) from error
         # Lengths have no unit, as in scenario files.
         attributes = {"long_name": "given kinematic viscosity", "units": "s-1"}
@@ -161,11 +157,10 @@ def _check_layers(
             expected = count
         if count != expected:
             raise DataError(
-                "scenarios have forces in different numbers of layers",
+                f"scenarios have forces in different numbers of layers: got {count} "
+                f"layers, expected {expected} layers, as in the scenarios before; "
+                f"{fix}",
                 where=f"{path}, variable 'body_force'",
-                expected=f"{expected} layers, as in the scenarios before",
-                got=f"{count} layers",
-                fix=fix,
             )
 
 
@@ -241,11 +236,9 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             raise reading_error(path, error, fix=fix) from error
         if not _is_of(key, attributes):
             raise DataError(
-                "a file holds another scenario",
+                f"a file holds another scenario: got {attributes}, expected {key}; "
+                f"{fix}",
                 where=str(path),
-                expected=key,
-                got=attributes,
-                fix=fix,
             )
         scenario.set_close(stack.pop_all().close)
     return scenario

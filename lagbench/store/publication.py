@@ -30,7 +30,7 @@ from .copy import (
     store_folder,
     suspend_fetching,
 )
-from .objects import NotDataError, Objects
+from .objects import Objects, WrongContentError
 
 MANIFEST_SECONDS = 10.0
 """Least time between two manifests while scenarios are being finished [s]."""
@@ -114,13 +114,10 @@ class Publication:
     def _put_file(self, entry: FileEntry) -> None:
         path = self._folder / entry.path
         if file_sha256(path) != entry.file_sha256:
-            root = self._objects.root
             raise DataError(
-                "a file of the working copy is not the one that its manifest names",
+                "a file of the working copy is not the one that its manifest names; "
+                "remove it and repeat the command",
                 where=str(path),
-                expected="the file that the manifest names",
-                got="another file",
-                fix=f"remove it, then lagbench generate with --root {root}",
             )
         if self._published.entry(entry.scenario) is not None:
             # The manifest must not name an object that is about to change.
@@ -179,7 +176,7 @@ class Publication:
     def _read_manifest(self) -> Manifest:
         """Return the store's manifest; an empty one where none can be read."""
         manifest = None
-        with suppress(NotDataError):  # it is written anew from the files
+        with suppress(WrongContentError):  # it is written anew from the files
             manifest = remote_manifest(self._size, self._objects.root, fresh=0.0)
         return manifest or merge_entries(self._size, None)
 

@@ -205,11 +205,8 @@ class FrameStore:
         path = self._paths[scenario]
         if not has_file(path):
             raise DataError(
-                "a scenario file is missing",
+                f"a scenario file is missing; {self._repair_hint(scenario)}",
                 where=str(path),
-                expected="a readable file",
-                got="nothing",
-                fix=self._repair_hint(scenario),
             )
         # Frames are cached here: HDF5 need not keep chunks too.
         file = h5py.File(path, "r", rdcc_nbytes=0)
@@ -273,12 +270,11 @@ class FrameStore:
         recorded_hash = size.registered_hash(scenario)
         if stated != expected or not content_hash.startswith(recorded_hash):
             raise DataError(
-                "a scenario file is not that of the registry",
+                f"a scenario file is not that of the registry: got {tuple(stated)}, "
+                f"content hash {content_hash[:16]}, expected (split, size, version, "
+                f"id, frames) = {tuple(expected)}, content hash "
+                f"{recorded_hash or 'any'}; {self._repair_hint(scenario)}",
                 where=str(self._paths[scenario]),
-                expected=f"(split, size, version, id, frames) = {tuple(expected)}, "
-                f"content hash {recorded_hash or 'any'}",
-                got=f"{tuple(stated)}, content hash {content_hash[:16]}",
-                fix=self._repair_hint(scenario),
             )
 
     def _read_id(self, file: h5py.File, scenario: int) -> int:
@@ -367,11 +363,9 @@ def _check_bytes(value: float, name: str) -> None:
     if value >= 0:
         return
     raise UsageError(
-        f"{name} is no number from 0",
+        f"{name} is no number from 0: {repr(value)[:80]}; give bytes, as in "
+        f"{name}=1e9, or leave {name} out",
         where=name,
-        expected="a number >= 0 [bytes]",
-        got=repr(value)[:80],
-        fix=f"give bytes, as in {name}=1e9, or leave {name} out",
     )
 
 
@@ -426,27 +420,23 @@ class WindowReader:
         where = f"{split} {tier.name}, {', '.join(subsets)}"
         if self.history < 1 or future < 0:
             raise UsageError(
-                "a window has at least one given frame",
+                f"a window has at least one given frame: history {self.history}, "
+                f"future {future}; leave history out for the task's "
+                f"{tier.task.input_frames}",
                 where=where,
-                expected="history >= 1, future >= 0",
-                got=f"history {self.history}, future {future}",
-                fix=f"leave history out for the task's {tier.task.input_frames}",
             )
         if not frame_counts:
             raise UsageError(
-                "no windows can be read like that",
+                "no windows can be read like that: 0 scenarios; name a subset, as in "
+                "subset='train'",
                 where=where,
-                expected="a subset at least",
-                got="0 scenarios",
-                fix="name a subset, as in subset='train'",
             )
         if not len(self):
             raise UsageError(
-                "no scenario is as long as a window",
+                f"no scenario is as long as a window: got {self.length}: history "
+                f"{self.history}, future {future}, expected at most "
+                f"{max(frame_counts)} frames; ask for fewer frames",
                 where=where,
-                expected=f"at most {max(frame_counts)} frames",
-                got=f"{self.length}: history {self.history}, future {future}",
-                fix="ask for fewer frames",
             )
         if verify:
             check_contents(tier, root_folder, paths)

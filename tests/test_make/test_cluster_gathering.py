@@ -15,7 +15,7 @@ from conftest import PAINT_PICTURES, SIZE, SPLIT
 
 from lagbench.data.manifest import build_manifest, read_manifest, write_manifest
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import DataError
 from lagbench.make.generate import GenerationResult, generate
 
 FOLDER = Path(SPLIT) / SIZE / "v2"
@@ -144,25 +144,6 @@ def test_what_no_part_holds_is_simulated(
     assert again.dataset_sha256 == generated.dataset_sha256
 
 
-def test_a_copy_where_nothing_can_be_linked(
-    parts: tuple[Path, Path],
-    gather: Gather,
-    generated: GenerationResult,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Across file systems files are copied; the parts may then be removed."""
-
-    def refuse(*_: object) -> None:
-        raise OSError(18, "Invalid cross-device link")
-
-    monkeypatch.setattr(os, "link", refuse)
-    result = gather(*parts)
-    for root in parts:
-        shutil.rmtree(root)
-    assert result.simulated == ()
-    assert everything(result.folder) == everything(generated.folder)
-
-
 def test_a_damaged_part_is_named(
     parts: tuple[Path, Path], tmp_path: Path, gather: Gather
 ) -> None:
@@ -176,16 +157,3 @@ def test_a_damaged_part_is_named(
             gather(parts[1])
         assert caught.value.where.endswith("part-1/curl-noise/tiny/v2/test/0004.nc")
     assert not (tmp_path / "whole" / FOLDER / "test" / "0004.nc").exists()
-
-
-def test_folders_without_parts(
-    tmp_path: Path, gather: Gather, copied: Callable[[], Path]
-) -> None:
-    """An empty folder, and the one that is written to, are no sources."""
-    with pytest.raises(UsageError) as caught:
-        gather(tmp_path / "none")
-    assert caught.value.where.endswith("/none")
-    root = copied()
-    with pytest.raises(UsageError) as caught:
-        gather(root, root=root)
-    assert caught.value.where.endswith("/root")

@@ -71,32 +71,6 @@ def test_a_file_that_is_there_keeps_its_entry(tmp_path: Path, size: Size) -> Non
     assert joint_entry.twin_floor == LIMIT
 
 
-@pytest.mark.parametrize("is_repacked", [False, True])
-def test_a_file_without_an_entry_is_named_where_it_is_that_of_the_source(
-    tmp_path: Path, size: Size, is_repacked: bool
-) -> None:
-    """Any other file waits for its inspection."""
-    root = tmp_path / "root"
-    source = tmp_path / "source"
-    write_root(root, size, 3)
-    write_root(source, size, 3)
-    if is_repacked:
-        repack(size.path(root, 3))
-    joint = gather(size, root, source, merge_entries(size, None))
-    assert (joint.entry(3) is None) == is_repacked
-
-
-def test_a_folder_in_the_place_of_a_file_is_not_named(
-    tmp_path: Path, size: Size
-) -> None:
-    root = tmp_path / "root"
-    source = tmp_path / "source"
-    write_root(source, size, 3, 4)
-    size.path(root, 3).mkdir(parents=True)
-    joint = gather(size, root, source, merge_entries(size, None))
-    assert list_ids(joint) == [4]
-
-
 def test_scenarios_that_the_size_lacks_stay_in_the_source(
     tmp_path: Path, size: Size
 ) -> None:

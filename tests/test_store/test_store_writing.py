@@ -12,21 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import PAINT_PICTURES, PICTURE_PAINTER, SIZE, SPLIT
-from object_stores import files, fill, machine, objects, put, remove
+from conftest import SIZE, SPLIT
+from object_stores import files, fill, machine, objects, put
 
-from lagbench.atomic import write_atomically
-from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import url_of
 from lagbench.data.local import resolve_root
-from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, WorkFailedError
+from lagbench.errors import WorkFailedError
 from lagbench.exchange import download
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.store import publication
-from lagbench.store.copy import suspend_fetching, update_working_copy
 from lagbench.store.objects import Objects
 
 FOLDER = f"{SPLIT}/{SIZE}/v2"
@@ -161,32 +157,6 @@ def test_what_is_there_is_neither_simulated_nor_fetched(
 
 
 @pytest.mark.slow
-def test_the_manifest_comes_last(
-    url: str,
-    run: Run,
-    simulated_here: Fill,
-    wrote: Wrote,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """At no time does it name an object that is not there; after the cards it is put
-    once more.
-    """
-    monkeypatch.setattr(publication, "MANIFEST_SECONDS", 0.0)
-    run(simulated_here(url))
-    names = [name for name, _ in wrote]
-    assert names[:5] == [
-        "train/0000.nc",
-        "train/0001.nc",
-        "valid/0002.nc",
-        "test/0003.nc",
-        "test/0004.nc",
-    ]
-    assert names[-3:] == ["croissant.json", "README.md", "manifest.json"]
-    for _, there in wrote:
-        assert {*named(there.get("manifest.json", b'{"files": []}'))} <= there.keys()
-
-
-@pytest.mark.slow
 def test_a_fault_in_the_middle_leaves_whole_objects(
     url: str, run: Run, simulated_here: Fill, generated: GenerationResult, wrote: Wrote
 ) -> None:
@@ -284,92 +254,6 @@ def leave_only(root: Path, *subsets: str) -> None:
     (root / MANIFEST).write_text(json.dumps(manifest))
 
 
-def test_a_dry_run_only_looks(full: str, run: Run) -> None:
-    """It counts what the store holds and puts nothing there."""
-    remove(full, f"{FOLDER}/valid/0002.nc")
-    before = objects(full)
-    result = run(full, dry_run=True)
-    assert result.simulated == (2,)
-    assert result.kept == (0, 1, 3, 4)
-    assert objects(full) == before
-    assert files(result.root) == {}
-
-
-def test_a_file_that_changed_is_not_put(
-    url: str, run: Run, simulated_here: Fill
-) -> None:
-    """What the manifest says of a file holds for the object, or there is none."""
-    simulated_here(url)
-    path = resolve_root(url) / FOLDER / "train/0000.nc"
-    data = path.read_bytes()
-    write_atomically(path, data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
-    with pytest.raises(DataError):
-        run(url, scenarios="3")
-    assert f"{FOLDER}/train/0000.nc" not in objects(url)
-
-
-def describe_own_split(original: LocalSplit, url: str) -> None:
-    """Put the description of a local split into the working copy of a store."""
-    folder = resolve_root(url) / "own"
-    folder.mkdir(parents=True)
-    shutil.copy(original.folder / "split.yaml", folder)
-
-
-def read_stored_scenarios(url: str) -> list[int]:
-    """Return the ids that the manifest of a store names."""
-    text = objects(url)["own/full/v1/manifest.json"]
-    manifest = Manifest.model_validate_json(text)
-    return [entry.scenario for entry in manifest.files]
-
-
-def test_a_download_keeps_the_entries_of_files_that_only_the_store_has(
-    original: LocalSplit, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A machine without files downloads one more subset into the store."""
-    source = original.folder.parent.as_uri()
-    describe_own_split(original, url)
-    download("own", root=url, mirror=source, subset="train")
-    machine(monkeypatch, tmp_path / "second")
-    describe_own_split(original, url)
-    result = download("own", root=url, mirror=source, subset="test")
-    assert result.downloaded == (3,)
-    assert read_stored_scenarios(url) == [0, 1, 3]
-
-
-def test_two_machines_download_simulated_data_into_a_store(
-    generated: GenerationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The card of the second one shows scenarios that only the store holds."""
-    monkeypatch.setattr(PICTURE_PAINTER, PAINT_PICTURES)
-    machine(monkeypatch, tmp_path / "first")
-    url = (tmp_path / "store").as_uri()
-    source = generated.root.as_uri()
-    download(SPLIT, SIZE, root=url, mirror=source, subset="test")
-    machine(monkeypatch, tmp_path / "second")
-    result = download(SPLIT, SIZE, root=url, mirror=source, subset="train,valid")
-    assert result.complete
-    stored = objects(url)
-    for name in ("README.md", "croissant.json"):
-        expected = (generated.root / FOLDER / name).read_bytes()
-        assert stored[f"{FOLDER}/{name}"] == expected
-
-
-def test_a_download_forgets_files_that_neither_store_nor_working_copy_has(
-    original: LocalSplit, url: str
-) -> None:
-    source = original.folder.parent.as_uri()
-    describe_own_split(original, url)
-    download("own", root=url, mirror=source)
-    for path in resolve_root(url).rglob("*.nc"):
-        path.unlink()
-    for name in objects(url):
-        remove(url, name)
-    result = download("own", root=url, mirror=source, subset="test")
-    assert result.downloaded == (3,)
-    assert not result.complete
-    assert read_stored_scenarios(url) == [3]
-
-
 def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
     """What a mirror has arrives there with its manifest; a second call fetches
     nothing.
@@ -396,43 +280,3 @@ def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
     again = download("own", root=url, mirror="file:///nowhere")
     assert again.downloaded == ()
     assert again.kept == (0, 1, 2, 3)
-
-
-def test_a_file_simulated_again_is_not_fetched_back(
-    full: str, unmeasured: Registry, simulated_here: Fill
-) -> None:
-    """A file of other bytes replaces the object, and no old one comes over it."""
-    simulated_here(full)
-    size = unmeasured.size(SPLIT, SIZE)
-    root = resolve_root(full)
-    path = root / FOLDER / "train/0000.nc"
-    path.write_bytes(path.read_bytes() + b"\0")
-    manifest = read_manifest(root, SPLIT, SIZE, 2)
-    with publication.publish(size, root, full) as store:
-        assert manifest is not None
-        first = manifest.files[0]
-        new = first.model_copy(
-            update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)}
-        )
-        store.put_files(
-            manifest.model_copy(update={"files": (new, *manifest.files[1:])}),
-            at_once=True,
-        )
-        store.fetch(size.scenarios)
-    assert objects(full)[f"{FOLDER}/train/0000.nc"] == path.read_bytes()
-    assert path.stat().st_size == new.bytes
-    assert named(objects(full)[MANIFEST])[0] == "train/0000.nc"
-
-
-def test_nothing_is_fetched_before_the_last_data_set_is_written(
-    full: str, unmeasured: Registry
-) -> None:
-    """Two data sets may be written into one store side by side."""
-    size = unmeasured.size(SPLIT, SIZE)
-    root = resolve_root(full)
-    with suspend_fetching(root):
-        with suspend_fetching(root):
-            assert not update_working_copy(size, root, [0])
-        assert not update_working_copy(size, root, [0])
-    assert update_working_copy(size, root, [0])
-    assert (root / FOLDER / "train/0000.nc").is_file()
