@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
-import pickle
-import shlex
 import socket
 import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from unittest.mock import Mock
 
 import netCDF4
 import pytest
@@ -23,18 +19,14 @@ from turns import of_this_turn
 
 from lagbench.baselines.catalogue import list_names
 from lagbench.baselines.checkpoint import load
-from lagbench.cli.model_options import data_option
 from lagbench.cli.program import app
-from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.submission.validation import validate
-from lagbench.work.machine import processor_name
 
 Command = Callable[..., Result]
 
 
-HUGE = ("--set", f"training.steps={10**40}")
 TINY = ("--split", "curl-noise", "--size", "tiny", "--threads", "1")
 
 
@@ -134,120 +126,6 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     )
 
 
-def test_the_speed_up_needs_the_solver(
-    lagbench: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without Taichi, predict prints that it knows no speed-up, and goes on."""
-    lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util,
-        "find_spec",
-        lambda name, *rest: None if name == "taichi" else find(name, *rest),
-    )
-    predicted = lagbench(
-        "predict", "runs/curl-noise/tiny/gns-0/weights.safetensors", "--threads", "1"
-    )
-    assert predicted.exit_code == 0
-    assert "no speed-up" in predicted.stderr
-    assert (
-        json.loads(Path("predictions.json").read_text())["solver_seconds_per_frame"]
-        is None
-    )
-    assert "lagbench[generate]" in predicted.stderr
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
-        (("--baseline", "supergatt", *TINY), 2, "did you mean 'supergat'"),
-        (TINY, 2, "--baseline gns"),
-        (("--baseline", "gns", "--split", "curl-nose"), 2, "did you mean 'curl-noise'"),
-        (
-            ("--baseline", "gns", *TINY, "--set", "model.latant=3"),
-            2,
-            "did you mean 'model.latent'",
-        ),
-        (("--baseline", "gns", *TINY, "--recipe", "shrt"), 2, "no recipe"),
-        (("--baseline", "gns", *TINY, *HUGE), 2, "training.steps"),
-        (("--baseline", "gns", *TINY, "--device", "tpu"), 2, "no device 'tpu'"),
-        (
-            ("--baseline", "gns", "--split", "cavity", "--size", "mini"),
-            4,
-            "lagbench generate",
-        ),
-        (("--baseline", "gns", *TINY, "--output", "/proc/none"), 5, "--output"),
-    ],
-)
-def test_mistakes_of_train(
-    lagbench: Command,
-    words: tuple[str, ...],
-    code: int,
-    message: str,
-) -> None:
-    """Every mistake has its exit code, and a message that says how to mend it. None
-    leaves a folder.
-    """
-    result = lagbench("train", *words)
-    assert result.exit_code == code
-    assert message in result.stderr
-    assert not Path("runs").exists()
-
-
-def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
-    """A pickle and a missing file are refused with 3."""
-    (tmp_path / "bomb.safetensors").write_bytes(pickle.dumps(os.getcwd))
-    assert (
-        lagbench("predict", "bomb.safetensors").exit_code
-        == lagbench("predict", "none.safetensors").exit_code
-        == 3
-    )
-
-
-def test_an_onnx_file_predicts_what_the_options_ask_for(
-    lagbench: Command, tmp_path: Path
-) -> None:
-    """The subset and the clock of the solver count; options of other models are
-    refused.
-    """
-    straight_on(tmp_path / "lines.onnx")
-    command = ("predict", "lines.onnx", "--split", "curl-noise", "--size", "tiny")
-    no_shift = lagbench(*command, "--subset", "shift")
-    assert no_shift.exit_code == 2
-    assert "no scored subset 'shift'" in no_shift.stderr
-    for words in (
-        ("--set", "model.average=true"),
-        ("--batch", "2"),
-        ("--device", "cuda"),
-        ("--threads", "2"),
-    ):
-        refused = lagbench(*command, *words)
-        assert refused.exit_code == 2
-        assert f"where: {words[0]}" in refused.stderr
-    predicted = lagbench(*command, "--no-bench", "--device", "cpu", "--threads", "1")
-    assert predicted.exit_code == 0, predicted.output
-    assert "next: lagbench score predictions.nc\n" in predicted.stdout
-    with netCDF4.Dataset("predictions.nc") as data:
-        assert data.getncattr("device") == f"{processor_name()}, 1 thread"
-
-
-@pytest.mark.slow
-def test_an_onnx_file_is_timed_beside_the_solver(
-    lagbench: Command, tmp_path: Path
-) -> None:
-    """The predictions state both times, so an entry can be compared with solvers."""
-    straight_on(tmp_path / "lines.onnx")
-    predicted = lagbench(
-        "predict", "lines.onnx", "--split", "curl-noise", "--size", "tiny"
-    )
-    assert predicted.exit_code == 0, predicted.output
-    assert "the model is" in predicted.stdout
-    with netCDF4.Dataset("predictions.nc") as data:
-        solver_seconds = data.getncattr("solver_seconds_per_frame")
-        seconds = data.getncattr("seconds_per_frame")
-    assert 0 < seconds < solver_seconds
-
-
 @pytest.mark.slow
 def test_a_local_split_is_predicted_by_its_folder(
     lagbench: Command, original: LocalSplit, tmp_path: Path
@@ -294,70 +172,6 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
         env=environment,
         timeout=300,
     )
-
-
-@pytest.mark.slow
-def test_bench_of_the_solver(lagbench: Command, original: LocalSplit) -> None:
-    """The solver is timed in a process of its own; nothing else can be timed, and no
-    local split.
-    """
-    done = command(
-        "lagbench",
-        "bench",
-        "solver",
-        "--split",
-        "curl-noise",
-        "--size",
-        "tiny",
-        "--frames",
-        "3",
-        "--json",
-    )
-    found = json.loads(done.stdout)
-    assert found["particles"] == 506
-    assert found["substeps"] == 12
-    assert found["frames"] >= 3
-    assert found["frames"] * found["seconds_per_frame"] >= 0.5
-    # 506 particles x 12 substeps at 30 to 40 ns each: a fifth of a millisecond; never a
-    # tenth of a second.
-    assert 1e-5 < found["seconds_per_frame"] < 0.1
-    assert lagbench("bench", "model", "--split", "curl-noise").exit_code == 2
-    refused = lagbench("bench", "solver", "--split", str(original.folder))
-    assert refused.exit_code == 2
-    assert "simulated" in refused.stderr
-
-
-def test_the_second_process_says_nothing(
-    lagbench: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A helper of a training over several processes prints and writes nothing, no error
-    either.
-    """
-    from lagbench.baselines import train
-    from lagbench.baselines.machine import is_helper
-
-    def told(error: BaseException, **ranks: str) -> tuple[int, str]:
-        for name in ("RANK", "LOCAL_RANK"):
-            monkeypatch.setenv(name, ranks.get(name, "0"))
-        assert is_helper() == bool(ranks)
-        monkeypatch.setattr(train, "train", Mock(side_effect=error))
-        result = lagbench("train", "--baseline", "gns", *TINY)
-        return result.exit_code, result.output
-
-    full = WorkFailedError("out of memory")
-    full.__cause__ = MemoryError()
-    for error, code in (
-        (KeyboardInterrupt(), 130),
-        (WorkFailedError("the loss is not finite"), 5),
-    ):
-        assert told(error)[0] == code
-        assert told(error)[1] != ""
-        assert told(error, RANK="1", LOCAL_RANK="1") == (code, "")
-    # What befell one process alone, and what another machine lacks, no other process
-    # tells.
-    assert "out of memory" in told(full, RANK="1", LOCAL_RANK="1")[1]
-    assert "no data" in told(DataError("no data"), RANK="1")[1]
-    assert told(KeyboardInterrupt(), RANK="1") == (130, "")
 
 
 SHARED = (
@@ -438,10 +252,3 @@ def test_two_processes_make_the_weights_of_one(
         # Adam's step where a gradient is nearly nothing follows its rounding: compare
         # norms, not numbers.
         assert (value - other[name]).norm() <= 1e-4 * value.norm(), name
-
-
-def test_a_root_with_a_space_is_quoted_in_the_next_command(tmp_path: Path) -> None:
-    """A reader copies the command as it stands."""
-    root = tmp_path / "my data"
-    root.mkdir()
-    assert shlex.split(data_option("cavity", root)) == ["--root", str(root)]

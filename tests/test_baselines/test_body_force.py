@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,16 +14,16 @@ from torch.testing import assert_close
 
 import lagbench
 from lagbench.baselines.augmentation import mirror_batch, shift_batch
-from lagbench.baselines.dataset_info import find_forcing, read_dataset_info
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import predict as predict_file
-from lagbench.baselines.train import UnseenForcingWarning, train
+from lagbench.baselines.train import train
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.tensors import Batch, TensorBox
-from lagbench.torch import WindowDataset, collate, predict
+from lagbench.torch import WindowDataset, collate
 
 SPLIT = "poiseuille"
 SIZE = load().size(SPLIT, "tiny")
@@ -76,26 +75,6 @@ def test_the_force_goes_with_the_frames(batch: Batch) -> None:
     later = given.followed_by(last)
     assert later.body_force is not None
     assert_close(later.body_force, force[:, 1:])
-
-
-def test_a_users_model_is_given_the_force_of_all_frames(root: Path) -> None:
-    """The last row that a rollout sees is that of the last predicted frame."""
-    seen: list[torch.Tensor] = []
-
-    def step(given: Batch) -> torch.Tensor:
-        assert given.body_force is not None
-        seen.append(given.body_force[0, given.frames])
-        return given.position[:, -1]
-
-    first, *_ = predict(step, SPLIT, size="tiny", root=root, history=2)
-    scenario, _ = first
-    with read_scenario(SIZE.path(root, scenario)) as file:
-        force = file.read("body_force")
-    task = SIZE.task
-    frame_count = task.input_frames + task.horizon
-    expected = force[task.input_frames : frame_count]
-    rows = torch.stack(seen[: task.horizon])
-    np.testing.assert_array_equal(rows.numpy(), expected)
 
 
 def for_both_windows(matrix: list[list[float]]) -> torch.Tensor:
@@ -168,55 +147,6 @@ def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) 
     without_force = replace(given, body_force=None)
     with pytest.raises(DataError):
         model.start(without_force)
-
-
-RECIPE = """\
-format: 1
-recipes:
-  poiseuille/tiny:
-    model: {model}
-    training: {{steps: 1, warmup_steps: 0}}
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("baseline", "model", "has_warning"),
-    [
-        ("gns", "{latent: 4, layers: 1}", True),
-        ("gns", "{latent: 4, layers: 1, body_force: true}", False),
-        ("neuralmpm", "{cells: 12, width: 8, bundle: 2}", True),
-        ("neuralmpm", "{cells: 12, width: 8, bundle: 2, body_force: true}", False),
-    ],
-)
-def test_a_training_says_that_its_model_does_not_see_the_force(
-    baseline: str, model: str, has_warning: bool, root: Path, tmp_path: Path
-) -> None:
-    recipe = tmp_path / "own.yaml"
-    recipe.write_text(RECIPE.format(model=model))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UnseenForcingWarning)
-        train(
-            baseline,
-            SPLIT,
-            "tiny",
-            recipe=str(recipe),
-            root=root,
-            output=tmp_path / "run",
-        )
-    messages = [str(warning.message) for warning in caught]
-    assert bool(messages) == has_warning, messages
-    if has_warning:
-        assert "--set model.body_force=true" in messages[0]
-
-
-@pytest.mark.slow
-def test_the_obstacle_of_a_data_set_is_found(
-    root: Path, tiny_split: Callable[..., GenerationResult]
-) -> None:
-    cylinder = load().size("cylinder", "tiny")
-    assert find_forcing(cylinder, tiny_split("cylinder").root) == {"obstacle"}
-    assert find_forcing(SIZE, root) == {"body_force"}
 
 
 def test_no_image_turns_the_layers_of_a_force(root: Path, tmp_path: Path) -> None:

@@ -4,13 +4,12 @@ the board.
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
 
 from lagbench.board.entry import EntryBudget
-from lagbench.submission.budget import MOST_VALIDATIONS, Budget, parse_budget, track_of
+from lagbench.submission.budget import Budget, track_of
 
 
 @pytest.mark.parametrize(
@@ -76,46 +75,6 @@ def test_the_track_is_converged_when_the_last_doubling_gains_little(
         validations=validations,
     )
     assert track_of("mini", long) == track
-
-
-def test_what_is_not_stated_gives_no_track() -> None:
-    """Neither the use of a GPU nor the windows seen are assumed."""
-    assert track_of("mini", Budget(cpu_hours=0.1, gpu_hours=0.0)) == "equal compute"
-    assert track_of("mini", Budget(cpu_hours=0.1, device="NVIDIA H100")) is None
-    settled = Budget(
-        steps=1000,
-        epochs=1.0,
-        best=1.0,
-        validations=((500, 1.0), (1000, 1.0)),
-    )
-    assert track_of("mini", settled) == "converged"
-    assert track_of("mini", settled.model_copy(update={"epochs": None})) is None
-
-
-VALIDATIONS = [[i, 1.0] for i in range(MOST_VALIDATIONS + 1)]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        *(
-            "",
-            "null",
-            "[]",
-            "{",
-            '{"track": "converged"}',
-            '{"cpu_hours": -1}',
-            '{"cpu_hours": NaN}',
-        ),
-        *('{"device": "\\n"}', json.dumps({"validations": VALIDATIONS})),
-    ],
-)
-def test_a_text_that_is_no_budget_gives_none(text: str) -> None:
-    """A track is not stated, hours are not negative, names printable; validations as
-    many as entries hold.
-    """
-    assert parse_budget(text) is None
-    assert parse_budget(json.dumps({"validations": VALIDATIONS[1:]})) is not None
 
 
 def test_an_entry_has_the_mean_budget_of_its_seeds() -> None:

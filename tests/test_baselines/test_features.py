@@ -24,7 +24,6 @@ from lagbench.baselines.graph import (
     radius_graph,
     wall_distance,
 )
-from lagbench.errors import UsageError
 
 BOUNDS = info().bounds
 
@@ -292,13 +291,6 @@ def test_the_target_makes_up_for_the_noise() -> None:
     assert_close(acceleration, expected, atol=1e-15, rtol=0)
 
 
-def test_a_single_frame_has_no_noise() -> None:
-    """Noise is on velocities, and one frame has none."""
-    truth = batch(swirl(0, 3)).position
-    disturbed = add_walk_noise(truth, 1, 0.3, generator())
-    assert torch.equal(disturbed, truth)
-
-
 def test_each_window_draws_the_deviation_of_its_noise() -> None:
     """Levels are uniform up to the largest, the same for all particles of a window."""
     windows = two_swirls()
@@ -312,15 +304,6 @@ def test_each_window_draws_the_deviation_of_its_noise() -> None:
             assert len(of_window.unique()) == 1
             drawn.append(float(of_window[0]))
     assert stats.kstest(np.array(drawn) / 0.5, "uniform").pvalue > 1e-3
-
-
-def test_levels_scale_the_noise_of_their_window() -> None:
-    """The same draws, times the level of the particle."""
-    truth = torch.zeros(3, 8, 2)
-    level = torch.tensor([0.0, 0.5, 1.0])[:, None, None]
-    scaled = add_walk_noise(truth, 6, level, generator(3))
-    whole = add_walk_noise(truth, 6, 1.0, generator(3))
-    assert_close(scaled, level * whole)
 
 
 @pytest.mark.parametrize(
@@ -378,38 +361,3 @@ def test_walls_move_with_the_particles_on_them() -> None:
         assert_close(own_wall_velocity, velocity, atol=1e-6, rtol=0)
         wall_orders.add(tuple(wall.tolist()))
     assert len(wall_orders) == 8
-
-
-def test_images_are_per_window_and_leave_the_data_alone() -> None:
-    """The first window stays, the second is mirrored: x becomes 1 - x in this box."""
-    windows = two_swirls()
-    original = windows.position.clone()
-    signs = torch.tensor([-1.0, 1.0])
-    mirror_x = torch.diag(signs)
-    matrices = torch.stack([torch.eye(2), mirror_x])
-    image = mirror_batch(windows, matrices, BOUNDS)
-    assert torch.equal(windows.position, original)
-
-    expected = original.clone()
-    second = expected[256:]
-    second[..., 0] = 1.0 - second[..., 0]
-    assert_close(image.position, expected)
-
-
-def test_mixed_precision_does_not_round_images() -> None:
-    windows = two_swirls()
-    matrices = draw_mirror_matrices(Symmetry.SQUARE, 2, generator(3))
-    exact = mirror_batch(windows, matrices, BOUNDS)
-    with torch.autocast("cpu", torch.bfloat16):
-        mixed = mirror_batch(windows, matrices, BOUNDS)
-    assert torch.equal(mixed.position, exact.position)
-    assert torch.equal(mixed.wall_velocity, exact.wall_velocity)
-
-
-def test_axes_change_places_only_in_a_square() -> None:
-    """In an oblong box a quarter turn is refused, with the option that works."""
-    quarter_turn = torch.eye(2).flip(0)[None]
-    oblong = ((0.0, 1.0), (0.0, 0.5))
-    window = batch(swirl(0, 3))
-    with pytest.raises(UsageError, match="symmetry: mirror"):
-        mirror_batch(window, quarter_turn, oblong)

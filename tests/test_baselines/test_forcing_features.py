@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,26 +13,16 @@ from simple_models import RADIUS, batch, info, network, rolled, swirl
 from torch import Tensor
 from torch.testing import assert_close
 
-import lagbench
 from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
 from lagbench.baselines.forcing import (
     ForcingFeatures,
     force_at,
     obstacle_features,
     skip_frames,
 )
-from lagbench.baselines.graph import edge_features
-from lagbench.baselines.predict import predict
-from lagbench.baselines.rollout import roll_out, scenario_batch
-from lagbench.baselines.train import UnseenForcingWarning, train
 from lagbench.data.box import Box
-from lagbench.data.local import locate
-from lagbench.errors import DataError, UsageError
-from lagbench.make.generate import GenerationResult
-from lagbench.models.registered import export_safetensors
 from lagbench.tensors import TensorBox
 
 UNIT = (0.0, 1.0)
@@ -115,21 +103,6 @@ def test_the_force_is_what_the_parabola_needs(name: str) -> None:
     expected = torch.zeros_like(acting)
     expected[:, 0] = torch.from_numpy(needed)
     assert_close(acting, expected, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["walls", "channel", "cube"])
-def test_beyond_a_wall_the_layer_at_the_wall_acts(name: str) -> None:
-    """Three layers between walls, each window with a force of its own."""
-    box = BOXES[name]
-    height = torch.tensor([-0.4, 0.1, 0.34, 0.66, 0.67, 0.9, 1.0, 1.7])
-    layer = [0, 0, 1, 1, 2, 2, 2, 2]
-    position = torch.full((8, box.dimension), 0.5)
-    position[:, 1] = height
-    sample = torch.tensor([0, 0, 0, 0, 1, 1, 1, 1])
-    shape = (2, 3, box.dimension)
-    layers = torch.arange(6.0 * box.dimension).reshape(shape)
-    acting = force_at(position, sample, layers, TensorBox(box))
-    assert torch.equal(acting, layers[sample, layer])
 
 
 @pytest.mark.parametrize("name", BOXES)
@@ -333,76 +306,7 @@ def test_images_of_a_window_have_images_of_the_features(
     assert_close(features(mirrored), expected, rtol=0.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["body_force", "obstacle"])
-def test_a_model_that_sees_what_is_not_there_says_so(name: str) -> None:
-    box = BOXES["periodic"]
-    model = seeing(box, **{name: True})
-    window = replace(forced_batch(box), **{name: None})
-    with pytest.raises(DataError) as caught:
-        model.start(window.part(slice(6)))
-    assert f"model.{name}=false" in str(caught.value.fix)
-
-
-OLD_OPTIONS: dict[str, object] = {"latent": 4, "layers": 1, "noise_std": 0.0}
 # Deviation of the output over the particles, by the code that knew neither option.
-OLD_DEVIATIONS = {
-    "gns": (0.0188042, 0.0116549),
-    "supergat": (0.0197916, 0.0126989),
-    "supergat-sd": (0.0198076, 0.0127191),
-    "gat": (0.0187936, 0.0129663),
-    "gatv2": (0.0197797, 0.0137934),
-    "pointnet": (0.0203832, 0.0136419),
-    "transformer": (0.0188321, 0.0131311),
-}
-
-
-@pytest.mark.parametrize("name", OLD_DEVIATIONS)
-def test_weights_without_the_options_give_the_numbers_that_they_gave(
-    name: str, tmp_path: Path
-) -> None:
-    """A header that lacks them means none, in a split with a force too; what drives the
-    flow changes no bit then.
-    """
-    restored = restored_from_old_weights(name, OLD_OPTIONS, tmp_path)
-    assert restored.forcing_seen == frozenset()
-
-    window = forced_batch(BOXES["walls"]).part(slice(6))
-    unforced = replace(window, body_force=None, obstacle=None)
-    assert torch.equal(rolled(restored, window, 3), rolled(restored, unforced, 3))
-
-    state = restored.start(window)
-    edges = restored.find_edges(state)
-    with torch.no_grad():
-        output, _ = restored.predict(state, edges)
-        # of features and edges that test_features.py compares with closed forms
-        node = restored.features(state.position, state.velocity, state.material)
-        edge = edge_features(state.position, edges, restored.radius, restored.box)
-        expected, _ = restored.network(node, edges, edge)
-    assert torch.equal(output, expected)
-    deviation = output.double().std(dim=0)
-    assert deviation.tolist() == pytest.approx(OLD_DEVIATIONS[name], rel=1e-3)
-
-
-def restored_from_old_weights(
-    name: str, options: dict[str, object], folder: Path
-) -> Any:
-    """Return a model from weights whose header lacks the options of force and obstacle.
-
-    The weights follow from a formula.
-    """
-    model = find(name).model.build(options, info())
-    stored_options = model.options.model_dump(mode="json")
-    del stored_options["body_force"]
-    del stored_options["obstacle"]
-    checkpoint = Checkpoint(
-        baseline=name,
-        options=stored_options,
-        info=info(),
-        weights=filled(model.state_dict()),
-    )
-    path = folder / "weights.safetensors"
-    save(path, checkpoint)
-    return restore(load(path))
 
 
 def filled(weights: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -421,27 +325,6 @@ FRAME_OPTIONS: dict[str, dict[str, object]] = {
     "lstm-mlp": {"latent": 4, "decoder": [4]},
 }
 # Deviation of the next state's positions, by the code that knew neither option.
-OLD_POSITION_DEVIATIONS = {
-    "mlp": (0.516565, 0.512492),
-    "lstm": (0.492446, 0.491787),
-    "lstm-mlp": (0.485983, 0.485343),
-}
-
-
-@pytest.mark.parametrize("name", FRAME_OPTIONS)
-def test_frame_models_without_the_options_give_the_numbers_that_they_gave(
-    name: str, tmp_path: Path
-) -> None:
-    restored = restored_from_old_weights(name, FRAME_OPTIONS[name], tmp_path)
-    assert restored.forcing_seen == frozenset()
-    window = restored.start(forced_batch(BOXES["walls"]).part(slice(6)))
-    assert window.body_force is None
-    assert window.obstacle is None
-    assert restored.network_inputs(window) is window.state
-    with torch.no_grad():
-        state = restored.next_state(window)
-    x, y, _, _ = state.double().std(dim=(0, 1)).tolist()
-    assert (x, y) == pytest.approx(OLD_POSITION_DEVIATIONS[name], rel=1e-3)
 
 
 @pytest.mark.parametrize("name", FRAME_OPTIONS)
@@ -508,122 +391,3 @@ def test_frame_models_see_the_force_towards_the_frame_after_each_state(
     model(window.part(slice(model.history + 1)))
     (states,) = inputs
     check(model.network_inputs(states), states, model.history - 1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("baseline", "split", "option"),
-    [
-        ("gns", "poiseuille", "body_force"),
-        ("gns", "cylinder", "obstacle"),
-        ("supergat", "cylinder", "obstacle"),
-        ("mlp", "cylinder", "obstacle"),
-        ("lstm", "poiseuille", "body_force"),
-    ],
-)
-def test_a_model_that_sees_them_is_trained_scored_and_exported(
-    baseline: str,
-    split: str,
-    option: str,
-    tiny_split: Callable[..., GenerationResult],
-    tmp_path: Path,
-) -> None:
-    """By the recipe of the split a graph network sees what drives the flow, without a
-    warning; the file that an entry carries gives the same rollout.
-    """
-    root = tiny_split(split).root
-    steps = ("training.steps=3", "training.warmup_steps=1", "training.validate_every=0")
-    small: tuple[str, ...] = (f"model.{option}=true",)
-    if baseline in ("gns", "supergat"):
-        small = ("model.latent=8", "model.layers=1")
-    trained = train(
-        baseline,
-        split,
-        "tiny",
-        root=root,
-        output=tmp_path / "run",
-        settings=(*steps, *small),
-        device="cpu",
-    )
-    checkpoint = load(trained.weights)
-    assert checkpoint.options[option] is True
-    output = tmp_path / "predictions.nc"
-    predict(trained.weights, output, root=root)
-    assert not lagbench.validate(output, root=root, isolated=False).errors
-    card = lagbench.score(output, root=root)
-    assert card.skill is not None
-    assert np.isfinite(card.skill.value)
-
-    model = restore(checkpoint)
-    path = export_safetensors(model, tmp_path / "m.safetensors", baseline=baseline)
-    exported = restore(load(path))
-    size = locate(split, "tiny", root=root).size
-    scenario = size.path(root, size.subsets["test"][0])
-    given = scenario_batch(scenario, slice(0, size.task.input_frames))
-    (rollout,) = roll_out(model, given, 2)
-    (again,) = roll_out(exported, given, 2)
-    assert torch.equal(again.position, rollout.position)
-
-    with pytest.raises(UsageError) as caught:
-        predict(
-            trained.weights,
-            tmp_path / "other.nc",
-            root=root,
-            settings=(f"model.{option}=false",),
-        )
-    assert option in str(caught.value.got)
-
-
-@pytest.mark.slow
-def test_weights_that_see_no_force_go_on_without_it(
-    tiny_split: Callable[..., GenerationResult], tmp_path: Path
-) -> None:
-    """Weights of older trainings predict as before, and a training from them warns."""
-    root = tiny_split("poiseuille").root
-    settings = (
-        "training.steps=1",
-        "training.warmup_steps=0",
-        "training.validate_every=0",
-        "model.latent=8",
-        "model.layers=1",
-    )
-    with pytest.warns(UnseenForcingWarning):
-        blind = train(
-            "gns",
-            "poiseuille",
-            "tiny",
-            root=root,
-            output=tmp_path / "blind",
-            settings=(*settings, "model.body_force=false"),
-            device="cpu",
-        )
-    checkpoint = load(blind.weights)
-    options = dict(checkpoint.options)
-    del options["body_force"]
-    del options["obstacle"]
-    old = tmp_path / "old.safetensors"
-    save(old, replace(checkpoint, options=options))
-    with pytest.warns(UnseenForcingWarning):
-        further = train(
-            "gns",
-            "poiseuille",
-            "tiny",
-            root=root,
-            output=tmp_path / "further",
-            start=old,
-            settings=settings[:3],
-            device="cpu",
-        )
-    assert load(further.weights).options["body_force"] is False
-    with pytest.raises(UsageError) as caught:
-        train(
-            "gns",
-            "poiseuille",
-            "tiny",
-            root=root,
-            output=tmp_path / "more",
-            start=old,
-            settings=(*settings[:3], "model.body_force=true"),
-            device="cpu",
-        )
-    assert "body_force" in str(caught.value.got)

@@ -15,7 +15,6 @@ from lagbench.baselines.free_flight import FALL_UNIT, FreeFlight, find_bodies
 from lagbench.baselines.rollout import scenario_batch, scenario_paths
 from lagbench.data.box import Box
 from lagbench.data.registry import load as load_registry
-from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.tensors import TensorBox
 
@@ -124,19 +123,6 @@ def test_bodies_are_the_components_of_all_pairs(
     assert bodies.body.tolist() == label.tolist()
 
 
-def test_large_bodies_of_two_windows_stay_apart() -> None:
-    """Both windows have the same particles at the same places."""
-    rng = np.random.default_rng(5)
-    block = torch.from_numpy(rng.uniform(0.3, 0.6, (300, 2)))
-    position = torch.cat([block, block])
-    sample = torch.arange(2).repeat_interleave(300)
-    box = TensorBox(Box.from_bounds([(0.0, 1.0)] * 2))
-    bodies = find_bodies(
-        position, torch.zeros_like(position), sample, reach=REACH, box=box
-    )
-    assert bodies.body.tolist() == [0] * 300 + [1] * 300
-
-
 def test_weights_lose_their_fall_in_a_model_without_free_flight() -> None:
     """A training may start from weights with free flight, and go on without it."""
     flying = network(free_flight=3.4)
@@ -145,15 +131,6 @@ def test_weights_lose_their_fall_in_a_model_without_free_flight() -> None:
     adapted, _ = plain.adapt_weights(weights, {})
     assert adapted.keys() == plain.state_dict().keys()
     assert "free_flight.fall" in weights
-
-
-def test_no_particles_are_no_bodies() -> None:
-    """An empty window has none."""
-    box = TensorBox(Box.from_bounds([(0.0, 1.0)] * 2))
-    nothing = torch.zeros(0, 2)
-    windows = torch.zeros(0, dtype=torch.int64)
-    bodies = find_bodies(nothing, nothing, windows, reach=REACH, box=box)
-    assert len(bodies.body) == len(bodies.flies) == 0
 
 
 def free_flight(gravity: Tensor, *, dimension: int = 2) -> FreeFlight:
@@ -247,19 +224,3 @@ def test_bodies_of_the_data_fall_as_the_law_says(
                 errors.append(float(error.abs().max()) / gravity)
     assert len(errors) >= 10
     assert max(errors) < 0.01  # of g
-
-
-def test_weights_without_a_fall_start_at_none() -> None:
-    """A training may go on with free flight; other weights stay as they are."""
-    plain = network(awake=True)
-    model = network(free_flight=3.4)
-    weights, _ = model.adapt_weights(plain.state_dict(), {})
-    assert weights.keys() == model.state_dict().keys()
-    assert torch.equal(weights["free_flight.fall"], torch.zeros(2))
-
-
-def test_forces_from_afar_exclude_free_flight() -> None:
-    """With a body force a body has no acceleration of its own."""
-    with pytest.raises(UsageError) as caught:
-        network(free_flight=3.4, body_force=True)
-    assert caught.value.where == "model.free_flight"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,14 +24,8 @@ from turns import of_this_turn
 from lagbench.baselines.augmentation import draw_waves
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.dataset_info import read_dataset_info
-from lagbench.baselines.operators import supergat
-from lagbench.baselines.operators.supergat import SuperGAT, draw_unlinked_pairs
-from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.simulator import (
-    GRID_TERMS,
     TERMS,
-    GraphNetwork,
     LossNorm,
     Motion,
     ParticleState,
@@ -40,10 +33,6 @@ from lagbench.baselines.simulator import (
 )
 from lagbench.data import grid as scoring
 from lagbench.data.grid import Grid
-from lagbench.data.registry import Registry
-from lagbench.errors import UsageError
-from lagbench.make.generate import GenerationResult
-from lagbench.torch import WindowDataset, collate
 
 GRID = Grid(10)
 SCALES = {
@@ -251,34 +240,6 @@ def test_a_linear_flow_costs_what_its_gradient_says(name: str, other_name: str) 
     assert float(terms["density"]) == 0.0
 
 
-@pytest.mark.parametrize(
-    "ignored",
-    [
-        ("vorticity", "velocity"),
-        GRID_TERMS,
-    ],
-)
-def test_terms_of_weight_zero_are_logged_without_a_graph(
-    ignored: tuple[str, ...],
-) -> None:
-    """Their values stay, but torch records no gradient for them."""
-    predicted, target = draw_motions(0)
-    predicted = require_gradients(predicted)
-    all_terms = compute_terms(predicted, target)
-    for value in all_terms.values():
-        assert value.requires_grad
-
-    weights = dict.fromkeys(ignored, 0.0)
-    terms = compute_terms(predicted, target, **weights)
-    without_gradient = set()
-    for name, value in terms.items():
-        expected = all_terms[name]
-        torch.testing.assert_close(value, expected, rtol=0.0, atol=0.0)
-        if not value.requires_grad:
-            without_gradient.add(name)
-    assert without_gradient == set(ignored)
-
-
 @pytest.mark.parametrize("name", TERMS)
 def test_every_term_pulls_towards_the_truth(name: str) -> None:
     """A small step against the gradient lowers the term as the gradient promises."""
@@ -345,34 +306,6 @@ def test_an_oracle_has_no_loss_after_own_steps() -> None:
         terms = model(batch(frames), seeded(seed))
         for name in TERMS:
             assert float(terms[name]) < 2e-5
-
-
-@pytest.mark.slow
-def test_noise_may_spread_over_its_levels() -> None:
-    """An untrained network leaves fluid at rest: the noise of its velocity is lost.
-
-    So the error is the square of the noise: with levels from none to the largest, a
-    third of it on average.
-    """
-    at_rest = np.repeat(swirl(0, 1), 8, axis=0)
-    windows = batch(*[at_rest] * 8)
-    means = {}
-    for spread in (False, True):
-        options = {"layers": 1, "latent": 4, "noise_spread": spread}
-        model = network(noise_std=1e-3, clamp=False, **options)
-        errors = []
-        for seed in range(25):
-            terms = model(windows, seeded(seed))
-            errors.append(float(terms["acceleration"].detach()))
-        means[spread] = np.mean(errors)
-    assert means[True] / means[False] == pytest.approx(1 / 3, rel=0.3)
-
-
-def test_no_noise_cannot_spread() -> None:
-    """The option says how noise is drawn, and there is none."""
-    with pytest.raises(UsageError) as caught:
-        network(noise_std=0.0, noise_spread=True)
-    assert caught.value.where == "model.noise_spread"
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -460,35 +393,6 @@ def test_compressed_particles_are_to_come_back() -> None:
     assert float(in_validation["velocity"]) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_compressed_particles_need_a_way_back() -> None:
-    """Without one the network would learn nothing from them."""
-    with pytest.raises(UsageError) as caught:
-        network(compression=0.5)
-    assert caught.value.where == "model.compression"
-
-
-def test_steps_without_gradients_predict_no_links(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """However many own steps come first, each layer draws unlinked pairs once."""
-    linked = GraphNetwork.with_operator(SuperGAT)
-    options = {"layers": 2, "latent": 8, "pushforward": 4, "noise_std": 0.0}
-    model = linked.build(options, info())
-    model.train()
-    draws = []
-
-    def count_draw(*arguments: Any, **keywords: Any) -> Tensor:
-        draws.append(arguments)
-        return draw_unlinked_pairs(*arguments, **keywords)
-
-    monkeypatch.setattr(supergat, "draw_unlinked_pairs", count_draw)
-    for seed in range(8):
-        terms = model(two_swirls(12), seeded(seed))
-        assert "link" in terms
-        assert model.training
-    assert len(draws) == 8 * 2
-
-
 @pytest.mark.parametrize(
     ("recovery", "error"),
     [
@@ -520,15 +424,6 @@ def test_recovery_asks_for_a_share_of_the_gap(
     pushed = error**2 * first
     expected = [first, pushed]
     assert sorted(losses) == pytest.approx(expected, rel=2e-2)
-
-
-def test_an_untrained_network_has_a_loss() -> None:
-    window = batch(swirl(0, 10))
-    model = network()
-    with torch.no_grad():
-        terms = model(window)
-    for name in ("acceleration", "velocity", "vorticity"):
-        assert float(terms[name]) > 1e-2
 
 
 def test_training_and_rollouts_take_the_same_step() -> None:
@@ -632,41 +527,6 @@ def test_rollout_losses_pass_gradients_through_all_steps() -> None:
     assert float(difference) > float(least)
 
 
-@pytest.mark.parametrize(
-    ("symmetry", "is_forced"),
-    [
-        ("square", False),
-        ("mirror", True),
-    ],
-)
-def test_training_leaves_the_batch_alone(symmetry: str, is_forced: bool) -> None:
-    """Noise and mirror images change no stored bit."""
-    window = two_swirls(7, walls=True)
-    origin = window.position[:, 0].clone()
-    viscosity = torch.full((window.windows,), 1e-3)
-    window = replace(window, origin=origin, viscosity=viscosity)
-    if is_forced:
-        # on two layers, shape [window, frame, layer, axis]
-        shape = (window.windows, 7, 2, 2)
-        force = torch.full(shape, 0.1)
-        window = replace(window, body_force=force)
-    before = {}
-    for field in fields(Batch):
-        value = getattr(window, field.name)
-        if value is not None:
-            before[field.name] = value.clone()
-    assert ("body_force" in before) is is_forced
-    model = network(
-        awake=True,
-        noise_std=1e-3,
-        symmetry=symmetry,
-        wall_velocity=True,
-    )
-    model(window, seeded(1))
-    for name, value in before.items():
-        assert torch.equal(getattr(window, name), value)
-
-
 def test_training_repeats_with_its_seed() -> None:
     """Equal seeds give equal terms, others do not; without a seed nothing is random."""
     window = two_swirls(7, walls=True)
@@ -712,68 +572,6 @@ def test_noise_is_in_the_scales_and_in_the_target() -> None:
     # 10,240 draws have an error of 2 %, and the truth has its share.
     loss = float(terms["velocity"])
     assert loss == pytest.approx(ratio.sum(), rel=0.05)
-
-
-def test_the_operators_own_loss_has_its_weight() -> None:
-    """SuperGAT's link prediction is a seventh term of weight 1 by default."""
-    linked = GraphNetwork.with_operator(SuperGAT)
-    model = linked.build(SMALL, info())
-    window = batch(swirl(0, 7))
-    terms = model(window, seeded(0))
-    assert set(terms) == {*TERMS, "link"}
-    assert model.weights["link"] == 1.0
-    assert "link" not in network().weights
-
-
-def test_weights_of_terms_can_be_chosen() -> None:
-    options = SMALL | {
-        "link_weight": 0.5,
-        "loss": {"vorticity": 0.0},
-    }
-    linked = GraphNetwork.with_operator(SuperGAT)
-    model = linked.build(options, info())
-    assert model.weights["link"] == 0.5
-    assert model.weights["vorticity"] == 0.0
-
-
-@pytest.mark.parametrize("name", ["gns", "supergat"])
-def test_terms_that_count_start_alive(
-    name: str,
-    generated: GenerationResult,
-    unmeasured: Registry,
-) -> None:
-    """Every term of a recipe's loss starts between 0.01 and 1 on generated data."""
-    recipe = recipe_for(find(name), "curl-noise", "tiny")
-    torch.manual_seed(0)
-    location: dict[str, Any] = {
-        "root": generated.root,
-        "registry": unmeasured,
-    }
-    dataset_info = read_dataset_info("curl-noise", "tiny", **location)
-    baseline = find(name)
-    model = baseline.model.build(recipe.model, dataset_info)
-    dataset = WindowDataset(
-        "curl-noise",
-        size="tiny",
-        history=model.history,
-        **location,
-    )
-    every_fourth = range(0, len(dataset), 4)
-    windows = collate([dataset[index] for index in every_fourth])
-    with torch.no_grad():
-        terms = model(windows, seeded(0))
-
-    counted_terms = {}
-    for term, value in terms.items():
-        weighted = model.weights[term] * float(value)
-        if weighted:
-            counted_terms[term] = weighted
-    expected = {"acceleration", "divergence", "vorticity", *model.operator.weights}
-    assert set(counted_terms) == expected
-    # Targets are standardised: half the sum of two components starts at 1 by
-    # construction.
-    for weighted in counted_terms.values():
-        assert 0.01 < weighted < 1.05
 
 
 OPERATORS = ["gns", "supergat", "gat", "gatv2", "pointnet", "transformer"]

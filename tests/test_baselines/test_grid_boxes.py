@@ -16,7 +16,6 @@ from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import (
     Symmetry,
-    check_symmetry,
     mirror_batch,
     mirror_matrices,
     shift_batch,
@@ -25,8 +24,6 @@ from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.data.box import Box
 from lagbench.data.grid import Grid, transfer
-from lagbench.data.registry import load
-from lagbench.errors import UsageError
 from lagbench.tensors import Batch, TensorBox
 
 Positions = NDArray[np.float64]
@@ -212,22 +209,6 @@ def test_spread_is_the_scorers_transfer(name: str) -> None:
     expected = transfer(place, velocity, Grid(8, box=box))
     momentum = np.moveaxis(expected.momentum, -1, 0)
     np.testing.assert_allclose(sums.numpy(), momentum, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["square", "cube", "duct"])
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
-def test_fields_of_another_type_are_gathered(name: str, dtype: torch.dtype) -> None:
-    """The result has the type of a product: networks may give bfloat16 or float64."""
-    grid = make_grid(name)
-    generator = torch.Generator().manual_seed(0)
-    place = torch.from_numpy(draw_places(name, 20))
-    stencil = grid.stencil(place.float(), one_layer(20))
-    field = torch.randn(1, 2, *grid.shape, generator=generator)
-    field = field.to(dtype)
-    gathered = grid.gather(stencil, field)
-    assert gathered.dtype == torch.promote_types(dtype, torch.float32)
-    expected = grid.gather(stencil, field.float())
-    assert_close(gathered.float(), expected)
 
 
 @pytest.mark.parametrize("name", ["square", "cube", "duct"])
@@ -422,43 +403,3 @@ def test_windows_are_shifted_along_periodic_axes_only() -> None:
         assert_close(ways, shift, rtol=0, atol=1e-6)
     difference = first[0, 0] - second[0, 0]
     assert abs(float(difference)) > 1e-3
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"conserve": True},
-        {"strain": True},
-        {"shape": [4]},
-        {"density": [4]},
-    ],
-)
-def test_options_for_flat_boxes_with_walls_are_refused(
-    options: dict[str, Any],
-) -> None:
-    for name in ("square", "room"):
-        with pytest.raises(UsageError) as caught:
-            surrogate(name, **options)
-        (option,) = options
-        assert caught.value.where == f"model.{option}"
-
-
-def test_axes_with_other_ends_do_not_change_places() -> None:
-    size = load().size("decaying-vortices", "tiny")
-    check_symmetry("square", size, find_forcing=frozenset)
-    half = size.model_copy(update={"periodic": ("x",)})
-    with pytest.raises(UsageError) as caught:
-        check_symmetry("square", half, find_forcing=frozenset)
-    assert caught.value.where == "model.symmetry"
-    check_symmetry("mirror", half, find_forcing=frozenset)
-
-
-@pytest.mark.parametrize("symmetry", ["mirror", "square"])
-def test_a_stream_has_no_mirror_images(symmetry: str) -> None:
-    size = load().size("cylinder", "tiny")
-    with pytest.raises(UsageError) as caught:
-        check_symmetry(symmetry, size, find_forcing=frozenset)
-    assert caught.value.where == "model.symmetry"
-    assert caught.value.expected == "none"
-    check_symmetry("none", size, find_forcing=frozenset)
-    check_symmetry(None, size, find_forcing=frozenset)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import pytest
 import torch
-from simple_models import OPERATORS, Graph, graph
+from simple_models import OPERATORS, graph
 from torch import Tensor, nn
 from torch.testing import assert_close
 from turns import of_this_turn
@@ -61,11 +60,6 @@ def largest_relative_error(value: Tensor, expected: Tensor) -> float:
     error = (value - expected).abs().max()
     scale = expected.abs().max()
     return (error / scale).item()
-
-
-def small_graph() -> Graph:
-    """Return a random graph with the features of the small network."""
-    return graph(30, 150, node=7, edge=3)
 
 
 def total_loss(prediction: Tensor, losses: Losses) -> Tensor:
@@ -146,32 +140,6 @@ def test_a_layer_is_the_interaction_network_node_by_node() -> None:
         assert_close(new_node[i], expected_node, rtol=1e-10, atol=1e-10)
 
 
-@EVERY
-def test_every_layer_adds_something_else_to_the_edges(operator: type[Operator]) -> None:
-    """Ten layers are not a factor of 1024."""
-    model = network(operator, layers=10)
-    latents: list[Tensor] = []
-
-    def record_edges(
-        _: nn.Module,
-        inputs: tuple[Tensor, ...],
-        __: object,
-    ) -> None:
-        latents.append(inputs[2].detach())
-
-    for layer in model.processor:
-        layer.register_forward_hook(record_edges)
-    model(*small_graph())
-    for before, after in itertools.pairwise(latents):
-        change = after - before
-        cosine = nn.functional.cosine_similarity(before, change, dim=1)
-        mean_change = change.abs().mean()
-        assert float(mean_change) > 0.1
-        assert float(cosine.max()) < 0.999  # doubling would give 1
-    growth = latents[-1].norm() / latents[0].norm()
-    assert float(growth) < 20.0
-
-
 def test_gns_has_1_6_million_parameters() -> None:
     """At latent 128 with 10 layers."""
     model = network(GNS, node_features=30, latent=128, layers=10)
@@ -188,41 +156,6 @@ def test_gns_has_1_6_million_parameters() -> None:
     expected = node_encoder + edge_encoder + 10 * layer + decoder
     assert count == expected
     assert count == 1_591_682
-
-
-Shapes = dict[str, torch.Size]
-
-
-def shapes_beside_operators(model: torch.nn.Module) -> Shapes:
-    """Return the shapes of all weights that do not belong to an operator."""
-    shapes = {}
-    for name, parameter in model.named_parameters():
-        if ".operator." not in name:
-            shapes[name] = parameter.shape
-    return shapes
-
-
-@EVERY
-def test_only_the_operator_differs(operator: type[Operator]) -> None:
-    """Names and shapes of all other weights are those of GNS."""
-    shapes = shapes_beside_operators(network(operator))
-    assert shapes == shapes_beside_operators(network(GNS))
-
-
-@EVERY
-def test_no_weight_is_idle(operator: type[Operator]) -> None:
-    """Gradients reach all parameters, as DistributedDataParallel needs it.
-
-    The bias of a key shifts all logits alike, so that its gradient may be 0.
-    """
-    model = network(operator)
-    prediction, losses = model(*small_graph())
-    loss = total_loss(prediction, losses)
-    loss.backward()
-    for name, parameter in model.named_parameters():
-        assert parameter.grad is not None, name
-        if not name.endswith("lin_key.bias"):
-            assert bool(parameter.grad.any()), name
 
 
 @EVERY

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from pydantic import ValidationError
 from simple_models import batch, greatest_difference, info, jittered, rolled, swirl
 from torch import Tensor, nn
 from torch.testing import assert_close
@@ -21,12 +19,9 @@ from torch.testing import assert_close
 from lagbench.baselines.augmentation import Symmetry, mirror_batch, mirror_matrices
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.checkpoint import round_weights
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.recipe import recipe_for
-from lagbench.baselines.start import TrainingStart
 from lagbench.data.registry import load
-from lagbench.errors import DataError, UsageError
 
 SMALL: dict[str, object] = {
     "cells": 10,
@@ -127,15 +122,6 @@ def test_untrained_models_keep_every_velocity() -> None:
     )
 
 
-def test_smoothing_keeps_the_energy_of_a_uniform_flow() -> None:
-    frames = drift((4e-3, -2e-3), 3)
-    model = surrogate(smoothing=0.2)
-    velocity = roll_out_velocities(model, batch(frames), 40).double()
-    energy = velocity.square().sum(dim=2)
-    mean_energy = energy.mean(dim=0).numpy()
-    assert_allclose(mean_energy, 2e-5, rtol=2e-3)
-
-
 def test_smoothing_damps_what_the_grid_does_not_see() -> None:
     """A share of the sub-grid velocity goes with every frame."""
     window = liquid(random_motion(1e-3))
@@ -145,26 +131,6 @@ def test_smoothing_damps_what_the_grid_does_not_see() -> None:
     deviation = predicted.std(dim=0).mean(dim=1)
     ratio = deviation[1:] / deviation[:-1]
     assert float(ratio.max()) < 0.85
-
-
-def test_a_model_that_sees_the_viscosity_depends_on_it() -> None:
-    """Of two windows with the same frames the predictions differ; without it not."""
-    frames = swirl(0, 3)
-    window = batch(frames, frames)
-    viscosity = torch.tensor([1e-4, 1e-2])
-    window = replace(window, viscosity=viscosity)
-    for sees_viscosity in (True, False):
-        model = surrogate(awake=0.1, viscosity=sees_viscosity)
-        predicted = rolled(model, window, 2)
-        first, second = predicted.chunk(2)
-        assert torch.equal(first, second) != sees_viscosity
-
-
-def test_a_viscosity_that_is_not_known_is_refused() -> None:
-    model = surrogate(viscosity=True)
-    window = batch(swirl(0, 3))
-    with pytest.raises(DataError):
-        model.start(window)
 
 
 @pytest.mark.parametrize("conserve", [False, True])
@@ -313,39 +279,6 @@ def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> 
     assert greatest_difference(even_mean, odd_mean) > 1e-5
 
 
-def burst_speed(spacing: float) -> float:
-    """Return the greatest speed in a lattice under a pressure, after one frame."""
-    model = surrogate(
-        conserve=True,
-        materials=[0],
-        bundle=1,
-        smoothing=0.0,
-    )
-    pressure_bias = model.network.end.bias[:3:2]
-    nn.init.constant_(pressure_bias, 1.0)
-    axis = np.arange(0.3 + spacing / 2, 0.7, spacing)
-    columns, rows = np.meshgrid(axis, axis)
-    lattice = np.stack([columns, rows], axis=-1)
-    frame = lattice.reshape(1, -1, 2)
-    frames = np.repeat(frame, 3, axis=0)
-    window = liquid(frames)
-    with torch.no_grad():
-        state = model.start(window)
-        _, frames = model.call(state)
-    ((_, velocity),) = frames
-    speed = velocity.norm(dim=1)
-    return float(speed.max())
-
-
-def test_thin_matter_bears_less() -> None:
-    """Under one pressure a lattice bursts at its rim, a thinner lattice far less."""
-    full = burst_speed(0.025)
-    assert full == pytest.approx(burst_speed(0.0125), rel=0.2)
-    thin = burst_speed(0.05)
-    assert thin < full / 5
-    assert burst_speed(0.1) < thin / 10
-
-
 @pytest.mark.parametrize(
     ("low", "is_pushed"),
     [
@@ -422,21 +355,6 @@ def test_the_mirror_average_has_the_symmetry_of_the_box(number: int, case: int) 
     assert has_difference is (number > 0)
 
 
-def test_the_mirror_average_in_half_precision() -> None:
-    """Under autocast the rollout is near that in full precision."""
-    model = surrogate(awake=0.1, symmetry="square", average=True)
-    window = batch(swirl(0, 3))
-    with torch.autocast("cpu", torch.bfloat16):
-        rounded = rolled(model, window, 4)
-    exact = rolled(model, window, 4)
-    assert_close(rounded, exact, rtol=0, atol=1e-4)
-
-
-def test_without_symmetry_there_is_no_mirror_average() -> None:
-    with pytest.raises(UsageError):
-        surrogate(average=True)
-
-
 def test_materials_in_one_place_come_to_one_velocity() -> None:
     """A grid that two clouds share holds them together where they lie in each other."""
     rng = np.random.default_rng(0)
@@ -459,23 +377,6 @@ def test_materials_in_one_place_come_to_one_velocity() -> None:
     assert velocity_difference() == pytest.approx(2e-3, rel=0.02)
     mixture_difference = velocity_difference(mixture=True)
     assert abs(mixture_difference) < 0.3 * 2e-3
-
-
-def test_materials_matter() -> None:
-    window = batch(swirl(0, 3))
-    next_material = (window.material + 1) % 4
-    exchanged = change_material(window, next_material)
-    model = surrogate(awake=0.1)
-    path = rolled(model, window, 2)
-    exchanged_path = rolled(model, exchanged, 2)
-    assert not torch.equal(path, exchanged_path)
-
-
-def test_a_material_that_the_options_do_not_name_is_refused() -> None:
-    window = batch(swirl(0, 3))
-    model = surrogate(materials=[0, 2])
-    with pytest.raises(DataError):
-        model.start(window)
 
 
 @pytest.mark.parametrize(
@@ -635,48 +536,6 @@ def test_each_frame_is_driven_by_its_own_walls() -> None:
     assert torch.equal(after_both, still)
 
 
-def test_the_last_known_walls_stay() -> None:
-    """A batch without walls of later frames rolls out as if its last ones stayed."""
-    model = surrogate(awake=0.1, wall_velocity=True)
-    whole = batch(swirl(0, 9), walls=True)
-    window = whole.part(slice(3))
-    known_walls = whole.wall_velocity[:, :3]
-    short = replace(window, wall_velocity=known_walls)
-    path = rolled(model, window, 6)
-    short_path = rolled(model, short, 6)
-    assert torch.equal(path, short_path)
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("materials", []),
-        ("materials", [1, 1]),
-        ("materials", [4]),
-        ("wall_velocity", True),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(option: str, value: object) -> None:
-    """Materials that do not exist, and walls of a split where none moves."""
-    options = {option: value}
-    changes = {"moving_walls": False}
-    with pytest.raises(UsageError) as caught:
-        surrogate(changes=changes, **options)
-    assert caught.value.where == f"model.{option}"
-
-
-@pytest.mark.parametrize("cells", [18, 20, 22, 30, 38, 42])
-def test_all_walls_have_as_many_nodes_beside_them(cells: int) -> None:
-    """With an odd number of cells walls would lie on nodes, so it is refused."""
-    grid = surrogate(cells=cells).grid
-    node_counts = set()
-    for side in grid.beside_walls():
-        node_counts.add(int(side.count_nonzero()))
-    assert len(node_counts) == 1
-    with pytest.raises(ValidationError):
-        surrogate(cells=cells + 1)
-
-
 @pytest.mark.slow
 def test_learns_a_swirl() -> None:
     """The rollout's error falls to a third of that of constant velocity.
@@ -748,64 +607,3 @@ def test_recipes_fit_every_split(split: str, size: str) -> None:
     parameters = model.parameters()
     parameter_count = sum(weight.numel() for weight in parameters)
     assert 2 * parameter_count <= 4e6  # bytes of the weights in bfloat16
-
-
-def both_grids(*cells: int) -> dict[str, object]:
-    """Return options with the same grids for shape matching and density projection."""
-    return {
-        "shape": list(cells),
-        "density": list(cells),
-    }
-
-
-@pytest.mark.parametrize(
-    ("earlier", "later", "shared_count"),
-    [
-        ({}, both_grids(4, 8), 0),
-        (both_grids(4), both_grids(4, 8), 1),
-        ({"shape": [4]}, both_grids(4, 8), 1),
-        ({"density": [4]}, both_grids(4, 8), 1),
-        ({"shape": [4]}, {"shape": [4, 8]}, 1),
-        ({"density": [4]}, {"density": [4, 8]}, 1),
-        (both_grids(4), both_grids(8), 0),
-        (both_grids(4, 8), both_grids(4, 16), 1),
-        (both_grids(4, 8), both_grids(4), 1),
-        (both_grids(4, 8), both_grids(8, 4), 0),
-        (both_grids(4, 8), {}, 0),
-    ],
-)
-def test_grids_that_stand_first_in_both_models_keep_their_weights(
-    earlier: dict[str, object],
-    later: dict[str, object],
-    shared_count: int,
-) -> None:
-    """The other grids start as in a new model; grids left out are dropped."""
-    before = surrogate(awake=0.1, **earlier)
-    model = surrogate(**later)
-    with torch.no_grad():
-        for weight in before.parameters():
-            weight.add_(0.01)
-    earlier_weights = round_weights(before)
-    state = model.state_dict()
-    new_weights = {name: value.clone() for name, value in state.items()}
-
-    training_options = set(before.options.in_training)
-    start = TrainingStart(
-        path=Path("earlier.safetensors"),
-        info=before.info,
-        weights=earlier_weights,
-        options=before.options.model_dump(mode="json", exclude=training_options),
-        record={},
-    )
-    start.load_into(model)
-
-    loaded = model.state_dict()
-    assert loaded.keys() == new_weights.keys()
-    for name, value in loaded.items():
-        new_value = new_weights[name]
-        expected = earlier_weights.get(name, new_value).to(value.dtype)
-        is_per_grid = name in {"projection.held", "projection.push"}
-        if is_per_grid and name in earlier_weights:
-            shared = expected[:shared_count]
-            expected = torch.cat([shared, new_value[shared_count:]])
-        assert_close(value, expected, rtol=0, atol=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import INFO, Bursting, Drift, State, install, save_untrained
+from simple_models import INFO, Bursting, Drift, State, install
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
@@ -24,8 +23,6 @@ from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find, load_all
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.dataset_info import read_dataset_info
-from lagbench.baselines.graph import radius_graph
-from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import (
     PredictionResult,
     predict,
@@ -35,8 +32,6 @@ from lagbench.baselines.rollout import roll_out, round_parameters, select_window
 from lagbench.baselines.runner import WeightsRunner
 from lagbench.data.registry import Registry
 from lagbench.errors import (
-    DataError,
-    UnreadableFileError,
     UsageError,
 )
 from lagbench.make.generate import GenerationResult
@@ -46,13 +41,6 @@ Predict = Callable[..., PredictionResult]
 
 
 RECIPE = {"name": "curl-noise/tiny", "training": {"seed": 3}}
-UNFINISHED = {
-    "state": "running",
-    "step": 9,
-    "steps": 70,
-    "recipe": RECIPE,
-}
-"""Log of a training that goes on, with the weights of the fixture."""
 
 
 class Scaled(Drift):
@@ -64,20 +52,6 @@ class Scaled(Drift):
     def __init__(self, options: Any, info: DatasetInfo) -> None:
         super().__init__(options, info)
         Scaled.last_info = info
-
-
-class Several(Drift):
-    """A Drift with several weights."""
-
-    class Options(Drift.Options):
-        """Options with the number of weights."""
-
-        count: int = 1
-
-    def __init__(self, options: Any, info: DatasetInfo) -> None:
-        super().__init__(options, info)
-        start = torch.full((options.count,), options.start)
-        self.a = torch.nn.Parameter(start)
 
 
 @pytest.fixture
@@ -181,22 +155,6 @@ def test_the_file_is_valid(
     assert report.valid, report.findings
 
 
-def test_the_file_describes_method_and_cost(run: Predict) -> None:
-    """The weights are not those of the best step."""
-    result = run(method="my drift", training={"best_step": 4})
-    attributes = read_attributes(result.path)
-    assert attributes["method"] == "my drift"
-    assert attributes["seed"] == 3
-    assert attributes["parameters"] == 1
-    assert "curl-noise/tiny, step 9" in attributes["training"]
-    assert "1 thread" in attributes["device"]
-    assert result.seconds_per_frame > 0
-    assert attributes["seconds_per_frame"] == result.seconds_per_frame
-    cost_file = result.path.with_suffix(".json")
-    cost = json.loads(cost_file.read_text())
-    assert cost["seconds_without_search"] == result.seconds_per_frame
-
-
 def test_a_model_that_computes_on_the_cpu_stays_there(
     run: Predict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,46 +204,6 @@ def test_a_rollout_that_diverges_at_once_stays_at_the_last_input_frame(
         last = position[5].astype(np.float32)
         assert (predicted[row] == last).all()
     assert set(result.diverged.values()) == {6}
-
-
-def test_the_search_that_is_timed_is_the_models(
-    generated: GenerationResult,
-    unmeasured: Registry,
-    tiny_info: DatasetInfo,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Where matter has collapsed, it searches the neighbours that the model hears."""
-    options = {
-        "latent": 4,
-        "layers": 1,
-        "neighbours": 3,
-    }
-    model = find("gns").model.build(options, tiny_info)
-    weights = tmp_path / "weights.safetensors"
-    checkpoint = Checkpoint(
-        baseline="gns",
-        options=options,
-        info=tiny_info,
-        weights=model.state_dict(),
-        training={"recipe": RECIPE},
-    )
-    save(weights, checkpoint)
-    limits = set()
-
-    def search(*arguments: Any, most: int | None, **options: Any) -> Tensor:
-        limits.add(most)
-        return radius_graph(*arguments, most=most, **options)
-
-    monkeypatch.setattr(prediction, "radius_graph", search)
-    predict(
-        weights,
-        tmp_path / "p.nc",
-        root=generated.root,
-        threads=1,
-        registry=unmeasured,
-    )
-    assert limits == {3}
 
 
 @pytest.mark.parametrize(
@@ -340,15 +258,6 @@ def test_the_cost_of_a_rollout_that_diverges_is_that_of_the_frames_before(
     scenario_file = next(generated.folder.glob("test/*.nc"))
     assert weights_runner.time(scenario_file, 2) == 1.0
     assert weights_runner.time(scenario_file, 10) == 1.0
-
-
-@pytest.mark.parametrize("batch", [-1, 0])
-def test_fewer_scenarios_side_by_side_than_one_are_refused(
-    run: Predict, tmp_path: Path, batch: int
-) -> None:
-    with pytest.raises(UsageError):
-        run(batch=batch)
-    assert not (tmp_path / "predictions.nc").exists()
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -442,12 +351,6 @@ def test_a_rollout_is_frozen_before_it_is_too_far(
     assert torch.isfinite(rollout.position).all()
 
 
-def test_a_rollout_leaves_the_mode_of_the_model() -> None:
-    drift = Drift.build({}, INFO).train()
-    roll_out(drift, make_windows([0.9]), 1)
-    assert drift.training
-
-
 def test_rounded_parameters_come_back_to_the_bit() -> None:
     model = torch.nn.Linear(8, 8)
     state = model.state_dict()
@@ -474,27 +377,6 @@ def test_only_the_input_frames_are_read(
     result = run(name="b.nc", root=root)
     predicted = read_variable(result.path)
     np.testing.assert_array_equal(predicted, expected)
-
-
-def test_missing_data_are_an_error(run: Predict, tmp_path: Path) -> None:
-    run()
-    output = tmp_path / "other.nc"
-    with pytest.raises(DataError) as caught:
-        predict(tmp_path / "weights.safetensors", output, root=tmp_path / "nowhere")
-    assert str(caught.value.where).endswith("nowhere/curl-noise/tiny/v2")
-
-
-def test_a_missing_checkpoint_is_unreadable(
-    generated: GenerationResult, tmp_path: Path
-) -> None:
-    with pytest.raises(UnreadableFileError) as caught:
-        predict(tmp_path / "none.safetensors", tmp_path / "p.nc", root=generated.root)
-    assert str(caught.value.where).endswith("none.safetensors")
-
-
-def test_a_missing_device_is_a_usage_error(run: Predict) -> None:
-    with pytest.raises(UsageError):
-        run(device="tpu")
 
 
 @pytest.fixture
@@ -569,14 +451,6 @@ def test_sizes_that_do_not_fit_are_refused(
         run("scaled", size="small", info=mini_info)
 
 
-def test_at_its_own_size_the_radius_of_the_training_counts(
-    run: Predict, tiny_info: DatasetInfo
-) -> None:
-    """No hash covers the radius."""
-    run("scaled", info=replace(tiny_info, radius=0.5))
-    assert Scaled.last_info.radius == 0.5
-
-
 def test_options_of_a_model_may_change(run: Predict) -> None:
     """The prediction is that of a training with the option. The file lists the
     ``--set`` of the training and that of the prediction separately.
@@ -597,47 +471,6 @@ def test_options_of_a_model_may_change(run: Predict) -> None:
     assert "training.steps=77" in of_training
     assert "model.explode_at=3" not in of_training
     assert of_prediction.endswith("model.explode_at=3")
-
-
-@pytest.mark.parametrize(
-    "setting", ["training.steps=3", "model.explode=1", "model.count=2"]
-)
-def test_options_that_need_other_weights_do_not_change(
-    run: Predict,
-    monkeypatch: pytest.MonkeyPatch,
-    setting: str,
-) -> None:
-    """Nor do those of the training and unknown ones."""
-    install(monkeypatch, several=Several)
-    with pytest.raises(UsageError):
-        run("several", settings=[setting])
-
-
-@pytest.mark.slow
-def test_no_image_falls_sideways(
-    tiny_split: Callable[..., GenerationResult], tmp_path: Path
-) -> None:
-    """Where gravity points down, a prediction refuses mirror images of the square."""
-    root = tiny_split("fluid").root
-    info = read_dataset_info("fluid", "tiny", root=root)
-    model = NeuralMPM.build({"symmetry": "mirror"}, info)
-    weights = tmp_path / "weights.safetensors"
-    output = tmp_path / "p.nc"
-    save_untrained(weights, "neuralmpm", model, info)
-    with pytest.raises(UsageError) as caught:
-        predict(weights, output, root=root, settings=["model.symmetry=square"])
-    assert caught.value.where == "model.symmetry"
-    assert not output.exists()
-
-
-def test_models_of_any_size() -> None:
-    """MLPs and the like are not among them."""
-    names = set()
-    for name, entry in load_all().items():
-        if entry.model.any_size:
-            names.add(name)
-    assert {"neuralmpm", "gns", "supergat"} <= names
-    assert not names & {"mlp", "lstm", "var"}
 
 
 def test_models_of_any_size_have_the_same_weights_at_each() -> None:
@@ -664,25 +497,3 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         if model.any_size:
             shapes = parameter_shapes(model, large)
             assert shapes == parameter_shapes(model, small), model.method
-
-
-def test_predictions_without_an_ending_have_costs_of_their_own(
-    run: Predict, tmp_path: Path
-) -> None:
-    run(name="run-0.5", method="mine")
-    run(name="run-0.6", method="other")
-    names = {path.name for path in tmp_path.glob("run-*")}
-    assert names == {"run-0.5", "run-0.5.json", "run-0.6", "run-0.6.json"}
-
-
-def test_predictions_are_not_replaced_in_silence(run: Predict, tmp_path: Path) -> None:
-    """The same method would lose its predictions too, as where weights changed."""
-    run(name="predictions.nc")
-    before = (tmp_path / "predictions.nc").read_bytes()
-    with pytest.raises(UsageError) as caught:
-        run(name="predictions.nc", start=2.0)
-    assert "--overwrite" in str(caught.value.fix)
-    assert (tmp_path / "predictions.nc").read_bytes() == before
-
-
-CORES = len(os.sched_getaffinity(0))

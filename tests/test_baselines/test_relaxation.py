@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from torch import Tensor
 from lagbench.baselines.relaxation import SHARE, SOFTNESS, Relaxation
 from lagbench.baselines.simulator import ParticleState
 from lagbench.data.box import Box
-from lagbench.errors import UsageError
 from lagbench.tensors import TensorBox
 
 RADIUS = 0.06
@@ -62,16 +60,6 @@ def densities(position: Tensor, *, periodic: bool) -> Tensor:
     square_distance = (way / support).square().sum(dim=2)
     kernel = (1.0 - square_distance).clamp(min=0.0) ** 3
     return kernel.sum(dim=1)
-
-
-def test_the_limit_is_a_multiple_of_the_mean_density() -> None:
-    """Of each window by itself: two particles, and one that is alone."""
-    position = torch.tensor([[0.5, 0.5], [0.56, 0.5], [0.5, 0.5]])
-    sample = torch.tensor([0, 0, 1])
-    limit = relaxation().limit(position, sample)
-    of_pair = 1.0 + (1.0 - (0.06 / SUPPORT[2]) ** 2) ** 3
-    expected = DENSEST * torch.tensor([of_pair, 1.0])
-    torch.testing.assert_close(limit, expected)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -123,21 +111,6 @@ def test_squeezed_particles_return_below_the_limit(dimension: int) -> None:
     way = part.box.displacement(crowded, relaxed)
     assert way.abs().max() > 0.01
     assert way.double().mean(dim=0).abs().max() < 1e-5
-
-
-def test_what_is_below_the_limit_stays() -> None:
-    """To the bit; another window that is crowded changes nothing."""
-    resting = lattice(30)
-    crowded = squeezed(resting)
-    part = relaxation(iterations=3)
-    limit = part.limit(resting, one_window(resting))
-    both = torch.cat([resting, crowded])
-    sample = torch.cat([one_window(resting), one_window(crowded) + 1])
-    relaxed = part(both, sample, limit.expand(2))
-    alone = part(crowded, one_window(crowded), limit)
-    assert torch.equal(relaxed[: len(resting)], resting)
-    torch.testing.assert_close(relaxed[len(resting) :], alone)
-    assert not torch.equal(alone, crowded)
 
 
 def test_particles_stay_between_walls() -> None:
@@ -233,12 +206,3 @@ def test_training_sees_relaxed_states(monkeypatch: pytest.MonkeyPatch) -> None:
     for seed in range(6):
         model(given, torch.Generator().manual_seed(seed))
     assert len(counts) > 3
-
-
-@pytest.mark.parametrize("options", [{"clamp": False}, {"neighbours": 20}])
-def test_options_that_contradict_relaxation_are_refused(
-    options: dict[str, Any],
-) -> None:
-    with pytest.raises(UsageError) as caught:
-        network(relaxation=2, **options)
-    assert caught.value.where == "model.relaxation"

@@ -18,7 +18,7 @@ from lagbench.baselines.augmentation import (
     draw_mirror_matrices,
     mirror_batch,
 )
-from lagbench.baselines.graph import radius_graph, wall_distance
+from lagbench.baselines.graph import radius_graph
 from lagbench.baselines.predict import predict
 from lagbench.baselines.train import train
 from lagbench.data.box import Box
@@ -89,15 +89,6 @@ def test_edges_are_the_pairs_within_the_radius(name: str, most: int | None) -> N
     pairs = set(zip(senders, receivers, strict=True))
     assert pairs == expected
     assert edges.shape[1] == len(expected)
-
-
-def test_periodic_axes_have_no_walls() -> None:
-    position = torch.tensor([[0.1, 0.1, 0.3]])
-    bounds = BOXES["cube"].bounds
-    periodic = (True, False, False)
-    distance = wall_distance(position, bounds, 0.5, periodic)
-    expected = torch.tensor([[1.0, 1.0, 0.2, 1.0, 0.6, 1.0]])
-    assert_close(distance, expected)
 
 
 @pytest.mark.parametrize("symmetry", [Symmetry.MIRROR, Symmetry.SQUARE])
@@ -261,23 +252,3 @@ def test_networks_of_whole_frames_train_on_equal_scenarios(
     assert position.shape == (6, 125, 3)
     assert position.min() >= 0.0
     assert position.max() < 1.0
-
-
-@pytest.mark.parametrize("baseline", ["var"])
-def test_other_models_say_that_they_know_no_such_box(
-    made: LocalSplit,
-    tmp_path: Path,
-    baseline: str,
-) -> None:
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(RECIPE)
-    with pytest.raises(lagbench.errors.UsageError) as caught:
-        train(
-            baseline,
-            str(made.folder),
-            output=tmp_path / "run",
-            recipe=str(recipe),
-            device="cpu",
-        )
-    assert "the box of" in str(caught.value.where)
-    assert not (tmp_path / "run" / "weights.safetensors").exists()

@@ -5,7 +5,6 @@ refused.
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -166,18 +165,6 @@ def test_a_training_starts_with_the_prediction_of_the_weights(
     assert np.array_equal(of_start, of_result)
 
 
-@pytest.mark.slow
-def test_a_training_from_its_own_end_begins_at_its_last_loss(run: Run) -> None:
-    """A training from its own end begins at the loss that it ended with; random weights
-    do not.
-    """
-    first = run("gns", "steps=30", "validate_every=0", to="first")
-    one_step = ("steps=1", "validate_every=0")
-    further = run("gns", *one_step, start=first.weights, to="further")
-    anew = run("gns", *one_step, to="anew")
-    assert further.loss["total"] < 0.95 * anew.loss["total"]
-
-
 def test_the_start_weights_stay_best_where_every_step_is_worse(
     run: Run,
     stored: Callable[..., Path],
@@ -211,28 +198,6 @@ def test_the_start_weights_stay_best_where_every_step_is_worse(
                 start=start,
                 to="bad",
             )
-
-
-def test_trainings_and_predictions_may_lie_in_the_home_folder(
-    run: Run,
-    stored: Callable[..., Path],
-    generated: GenerationResult,
-    unmeasured: Registry,
-    home_folder: Path,
-) -> None:
-    """As other files that functions of the package write."""
-    shutil.copy(stored(), home_folder / "start.safetensors")
-    result = run("any", *STILL, start="~/start.safetensors", output="~/trained")
-    assert result.weights == home_folder / "trained" / "weights.safetensors"
-    prediction = predict(
-        "~/trained/weights.safetensors",
-        "~/made.nc",
-        root=generated.root,
-        registry=unmeasured,
-        threads=1,
-    )
-    assert prediction.path == home_folder / "made.nc"
-    assert prediction.path.is_file()
 
 
 def test_the_record_counts_the_hours_before_the_start(
@@ -295,18 +260,6 @@ def test_steps_before_the_start_count_for_convergence(
         start_steps=start_steps,
     )
     assert track_of("mini", flat) == track
-
-
-def test_a_long_training_without_progress_converges() -> None:
-    """Two thirds of all steps brought nothing."""
-    long = Budget(
-        steps=30,
-        cpu_hours=9.0,
-        best=0.5,
-        validations=((9, 0.5), (30, 0.5)),
-        start_steps=10,
-    )
-    assert track_of("mini", long) == "converged"
 
 
 def test_an_interrupted_training_goes_on_with_the_same_bits(

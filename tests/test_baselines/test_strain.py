@@ -15,7 +15,6 @@ from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.baselines.strain import UNIT, RestShape, first_frame
-from lagbench.errors import UsageError
 
 BOUNDS = info().bounds
 
@@ -69,16 +68,6 @@ def test_affine_motion_has_the_strain_of_its_matrix(gradient: Matrix) -> None:
     assert_allclose(mean, expected, rtol=0, atol=0.02)
 
 
-def test_strain_under_autocast_has_the_same_bits() -> None:
-    first = square_body(0)
-    sheared = change_shape(first, [[1.1, 0.05], [-0.02, 0.92]])
-    moved = sheared + 0.05
-    expected = rest_shape(first).strain(moved)
-    with torch.autocast("cpu", torch.bfloat16):
-        strain = rest_shape(first).strain(moved)
-    assert torch.equal(strain, expected)
-
-
 def test_bodies_in_layers_of_their_own_fly_apart_unstrained() -> None:
     """Neither of two bodies is strained that lie in each other at first and part."""
     first = square_body(0)
@@ -110,24 +99,3 @@ def test_an_image_is_strained_as_an_image() -> None:
     expected = last_strain(window) * torch.tensor([1.0, -1.0, 1.0])
     image_strain = last_strain(image)
     torch.testing.assert_close(image_strain, expected, rtol=0, atol=1e-3)
-
-
-def resting_window() -> Batch:
-    """Return a window of three equal frames."""
-    first = jittered(0)[None]
-    return batch(first.repeat(3, axis=0))
-
-
-def test_windows_from_the_first_frame_have_it() -> None:
-    window = resting_window()
-    assert torch.equal(first_frame(window), window.position[:, 0])
-
-
-def test_later_windows_must_bring_the_first_frame() -> None:
-    window = resting_window()
-    later = replace(window, frame=window.frame + 4)
-    with pytest.raises(UsageError, match="origin"):
-        first_frame(later)
-    origin = square_body(1)
-    with_origin = replace(later, origin=origin)
-    assert torch.equal(first_frame(with_origin), origin)

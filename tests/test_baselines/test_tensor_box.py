@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
-from simple_models import INFO, Drift
 
-from lagbench.baselines.var import VAR
 from lagbench.data.box import Box
-from lagbench.errors import UsageError
 from lagbench.tensors import TensorBox
 
 UNIT = (0.0, 1.0)
@@ -100,18 +95,3 @@ def test_gradients_are_those_of_a_difference(box: Box) -> None:
     way.sum().backward()
     assert end.grad is not None
     assert bool((end.grad == 1.0).all())
-
-
-def test_a_box_adds_nothing_to_the_weights() -> None:
-    assert not TensorBox(SOLID).state_dict()
-
-
-def test_only_authors_of_a_model_read_how_to_allow_any_box() -> None:
-    """Users of the models in the package cannot change them."""
-    periodic = replace(INFO, periodic=("x",))
-    with pytest.raises(UsageError) as caught:
-        Drift(Drift.Options(), periodic)
-    assert "any_box = True" in str(caught.value.fix)
-    with pytest.raises(UsageError) as caught:
-        VAR.build({}, periodic)
-    assert "any_box" not in str(caught.value.fix)

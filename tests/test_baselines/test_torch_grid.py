@@ -16,7 +16,6 @@ from lagbench.baselines import torch_grid
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.data import grid as reference
 from lagbench.data.grid import Grid, Placement, transfer
-from lagbench.errors import UsageError
 
 GRIDS = [
     Grid(8),
@@ -269,31 +268,6 @@ def test_lost_particles_have_no_weight_and_no_gradient() -> None:
         assert bool(gradient[3:].any())
 
 
-@pytest.mark.parametrize(
-    ("position_shape", "velocity_shape", "sample_count"),
-    [
-        ((5, 2), (4, 2), None),
-        ((5, 3), (5, 3), None),
-        ((2,), (2,), None),
-        ((5, 2), (5, 2), 4),
-        ((1, 5, 2), (1, 5, 2), 5),
-    ],
-)
-def test_shapes_that_do_not_fit_are_refused(
-    position_shape: tuple[int, ...],
-    velocity_shape: tuple[int, ...],
-    sample_count: int | None,
-) -> None:
-    """Positions, velocities and windows have to be of one length."""
-    position = torch.zeros(position_shape)
-    velocity = torch.zeros(velocity_shape)
-    sample = None
-    if sample_count is not None:
-        sample = torch.zeros(sample_count, dtype=torch.int64)
-    with pytest.raises(UsageError):
-        torch_grid.transfer(position, velocity, Grid(4), sample=sample)
-
-
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 BOX = ((0.0625, 0.9375), (0.0625, 0.9375))
 OBLONG_BOX = ((0.1, 0.9), (0.2, 0.5))
@@ -455,35 +429,6 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
     assert_close(moment, no_moment, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("swap", [False, True])
-@pytest.mark.parametrize(
-    "signs",
-    [
-        (1, 1),
-        (-1, 1),
-        (1, -1),
-        (-1, -1),
-    ],
-)
-def test_the_image_of_a_transfer_is_the_transfer_of_the_image(
-    signs: tuple[int, int], swap: bool
-) -> None:
-    """All eight mirror images of the square, each with and without a quarter turn."""
-    grid = ParticleGrid(BOX, 11, multiple=4)
-    place = draw_cloud(300)
-    image = (place - 0.5) * torch.tensor(signs) + 0.5
-    if swap:
-        image = image.flip(1)
-
-    mirrored_axes = [axis for axis in (0, 1) if signs[axis] < 0]
-    mass = spread_mass_of(grid, place)
-    expected = mass.flip(mirrored_axes)
-    if swap:
-        expected = expected.T
-    image_mass = spread_mass_of(grid, image)
-    assert_close(image_mass, expected, rtol=0, atol=1e-4)
-
-
 def test_walls_lie_between_two_rows_of_nodes() -> None:
     """The nodes beside a wall are half a cell from it, on both sides."""
     grid = ParticleGrid(BOX, 7)
@@ -494,28 +439,3 @@ def test_walls_lie_between_two_rows_of_nodes() -> None:
         nearest = distance[wall][beside.bool()].abs()
         half_cell = torch.full_like(nearest, grid.spacing / 2)
         assert_close(nearest, half_cell)
-
-
-@pytest.mark.parametrize("cells", [22, 30])
-def test_opposite_walls_have_as_many_rows_beside_them(cells: int) -> None:
-    """In a box of two sides, walls may lie on nodes."""
-    grid = ParticleGrid(((0.0, 1.0), (0.0, 0.5)), cells, multiple=4)
-    sums = [int(beside.sum()) for beside in grid.beside_walls()]
-    assert sums[0] == sums[1] > 0
-    assert sums[2] == sums[3] > 0
-
-
-def test_positions_without_a_number_gather_no_number() -> None:
-    """A rollout that diverges gives NaN, which the rollout freezes, and no error."""
-    grid = ParticleGrid(BOX, 7)
-    place = torch.tensor(
-        [
-            [torch.nan, 0.5],
-            [0.5, 0.5],
-        ]
-    )
-    stencil = grid.stencil(place, one_window(2))
-    ones = torch.ones(1, 1, *grid.shape)
-    gathered = grid.gather(stencil, ones)
-    assert gathered[0].isnan().all()
-    assert gathered[1].isfinite().all()

@@ -7,7 +7,7 @@ import random
 import shutil
 import signal
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
@@ -462,47 +462,11 @@ def test_a_share_of_the_windows_are_openings(data: WindowDataset, ranks: int) ->
     assert len(draws) == ranks
 
 
-def test_resumed_steps_are_not_counted_in_the_rate(run: Run) -> None:
-    """A run that goes on at step 3 reports 0 steps per second at first."""
-    settings = ("steps=5", "validate_every=0", "checkpoint_every=1")
-    with pytest.raises(KeyboardInterrupt):
-        run("drift", *settings, progress=interrupt_at(3))
-    reports: list[Progress] = []
-    run("drift", *settings, progress=reports.append)
-    assert [report.done for report in reports] == [3, 4, 5]
-    assert {report.total for report in reports} == {5}
-
-    # If one second had passed between the reports:
-    rates = []
-    for second, report in enumerate(reports, start=1):
-        rates.append(replace(report, seconds=float(second)).rate)
-    assert rates == [0.0, 1 / 2, 2 / 3]
-
-
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
 def test_gravity_allows_no_square_of_images(split: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError) as caught:
         train("gns", split, "tiny", root=tmp_path, settings=("model.symmetry=square",))
     assert caught.value.where == "model.symmetry"
-
-
-@pytest.mark.parametrize(
-    ("split", "symmetry"),
-    [
-        ("fluid", "mirror"),
-        ("multimaterial", "mirror"),
-        ("cavity", "square"),
-    ],
-)
-def test_a_symmetry_of_the_box_is_allowed(
-    split: str,
-    symmetry: str,
-    tmp_path: Path,
-) -> None:
-    """The training then looks for its data, which are not there."""
-    settings = (f"model.symmetry={symmetry}",)
-    with pytest.raises(DataError):
-        train("gns", split, "tiny", root=tmp_path, settings=settings)
 
 
 class FittedDrift(Drift):
@@ -544,15 +508,6 @@ class EagerDrift(FittedDrift):
         return {}
 
 
-def test_a_fit_that_evaluates_while_it_reads_is_counted_once(run: Run) -> None:
-    """No more is done than there is to do."""
-    reports: list[Progress] = []
-    run("eager", progress=reports.append)
-    fitting = [report for report in reports if report.stage == "fitting"]
-    assert [report.done for report in fitting] == [1, 2]
-    assert all(report.done <= report.total for report in reports)
-
-
 def test_a_users_fit_gets_whole_scenarios_as_batches(
     run: Run, generated: GenerationResult
 ) -> None:
@@ -581,47 +536,3 @@ def test_a_users_fit_gets_whole_scenarios_as_batches(
     fitting = [report for report in reports if report.stage == "fitting"]
     assert [report.done for report in fitting] == [1, 2, 3]
     assert fitting[-1].total == 3
-
-
-def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
-    """A fit that measures rollouts takes minutes; each measurement is reported.
-
-    The rate is that of the evaluations alone, of which the first starts the clock.
-    """
-    reports: list[Progress] = []
-    evaluations = 4
-    run(
-        "hybrid-projection",
-        f"model.evaluations={evaluations}",
-        "model.frames=3",
-        "model.scenarios=1",
-        progress=reports.append,
-    )
-    reading = [report for report in reports if report.stage == "reading"]
-    assert reading[0].unit == "scenarios"
-    assert reading[-1].done == reading[-1].scenarios == 1  # of two in train
-    fitting = [report for report in reports if report.stage == "fitting"]
-    first = fitting[0]
-    assert first.unit == "evaluations"
-    assert first.done == 1
-    assert first.rate == 0.0
-    assert first.total == first.scenarios == evaluations + 1
-    last = fitting[-1]
-    assert evaluations <= last.done <= last.total
-
-
-@pytest.mark.parametrize(
-    ("baseline", "split", "words"),
-    [
-        ("hybrid-coarse", "cylinder", "free surfaces of lagbench only"),
-        ("hybrid-projection", "fluid-3d", "full boxes only"),
-        ("var", "poiseuille", "boxes with walls only"),
-        ("var", "cavity-3d", "two dimensions only"),
-    ],
-)
-def test_no_recipe_is_asked_for_where_none_can_help(
-    tmp_path: Path, baseline: str, split: str, words: str
-) -> None:
-    """The model does not know such data; no file of recipes would change that."""
-    with pytest.raises(UsageError, match=words):
-        train(baseline, split, "tiny", root=tmp_path)

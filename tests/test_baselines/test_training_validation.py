@@ -12,7 +12,7 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import Drift, read_training_log, trainer
+from simple_models import Drift, trainer
 
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.dataset_info import read_dataset_info
@@ -180,58 +180,6 @@ def test_validations_share_a_training_evenly(
     assert validated[-1] == steps
     if count > 1:
         assert validated[count // 2 - 1] == steps // 2
-
-
-def test_a_recipe_may_choose_the_validated_steps() -> None:
-    """What it names in `validate_every` wins; 0 means never."""
-    every_fourth = TrainingOptions(validate_every=4)
-    never = TrainingOptions(validate_every=0)
-    assert validated_steps(every_fourth, steps=10, validations=1) == [4, 8, 10]
-    assert validated_steps(never, steps=10, validations=8) == []
-
-
-def test_a_training_records_windows_times_and_validations(run: Run) -> None:
-    """Record, weights and result hold windows, epochs, times, machine, and the best
-    validation.
-    """
-    settings = ("steps=8", "batch=3", "validate_every=2", "model.start=1.0")
-    result = run("drift", *settings, "learning_rate=0.5")
-    record = read_training_log(result.folder)
-    stored = load(result.weights).training
-    assert record["budget"] == stored["budget"]
-    budget = record["budget"]
-    # 48 windows in train: a step sees three
-    assert budget["windows"] == 24
-    assert budget["epochs"] == 0.5
-    assert budget["steps"] == 8
-    assert result.windows_seen == 24
-    assert result.epochs == 0.5
-    assert result.threads == 1
-    told = []
-    for entry in record["validation"]:
-        told.append([entry["step"], entry["vorticity_nrmse"]])
-    validated = [step for step, _ in told]
-    best_step, best = min(told, key=lambda one: one[1])
-    assert budget["validations"] == told
-    assert validated == [2, 4, 6, 8]
-    assert budget["best_step"] == best_step
-    assert budget["best"] == best
-    assert stored["step"] == result.best_step == budget["best_step"] < 8
-    assert budget["gpu_hours"] == 0.0
-    assert result.gpu_seconds == 0.0
-    hours = budget["cpu_hours"] + budget["validation_hours"]
-    assert hours > 0
-    assert 3600 * hours == pytest.approx(record["cpu_seconds"], rel=1e-4)
-
-
-@pytest.mark.slow
-def test_long_records_are_thinned(run: Run) -> None:
-    """Of 22 validations a budget keeps at most 20, the last one among them."""
-    result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")
-    budget = read_training_log(result.folder)["budget"]
-    told = budget["validations"]
-    assert len(told) <= 20
-    assert told[-1][0] == 22
 
 
 def test_fewer_frames_for_tests(

@@ -24,7 +24,6 @@ from lagbench.baselines.var import (
     principal_directions,
     solve,
 )
-from lagbench.errors import WorkFailedError
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -141,22 +140,6 @@ def test_the_solution_is_that_of_lapack(
         assert relative_error(normal_equations, expected) > tolerance
 
 
-def test_equal_columns_fit_as_well() -> None:
-    """The fit to a singular matrix is as good as the best; its condition says so."""
-    states = series(200, 12)
-    states[:, 5] = states[:, 4]
-    rows = LaggedRows([states], lags=1)
-    solution = solve(rows)
-    x = design_matrix(states, 1)
-    y = states[1:].astype(float)
-    residual = y - x @ solution.coefficients
-    least_residual = y - x @ least_squares(x, y)
-    error = np.square(residual).sum()
-    best = np.square(least_residual).sum()
-    assert error == pytest.approx(best, rel=1e-6)
-    assert solution.condition > 1e6
-
-
 def test_rows_stay_within_scenarios_and_blocks_add_up() -> None:
     """Scenarios longer than a block or too short equal one stacked fit."""
     longer_than_a_block = series(BLOCK + 300, 3, seed=1)
@@ -177,42 +160,6 @@ def test_rows_stay_within_scenarios_and_blocks_add_up() -> None:
     assert sum(block_lengths) == len(x)
     coefficients = solve(rows).coefficients
     assert relative_error(coefficients, least_squares(x, y)) < 1e-12
-
-
-def test_scenarios_as_short_as_the_lags_are_refused() -> None:
-    rows = LaggedRows([series(2, 3)], lags=2)
-    with pytest.raises(WorkFailedError, match="nothing to fit"):
-        solve(rows)
-
-
-def test_values_that_are_not_finite_are_refused() -> None:
-    states = series(30, 3)
-    states[4, 1] = np.nan
-    rows = LaggedRows([states], lags=1)
-    with pytest.raises(WorkFailedError, match="not finite"):
-        solve(rows)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("frames", [30, 3])
-def test_responses_that_are_not_finite_are_refused(frames: int, value: float) -> None:
-    """The last frame is a response only; few rows are solved in another way."""
-    states = series(frames, 3)
-    states[-1, 1] = value
-    rows = LaggedRows([states], lags=1)
-    with pytest.raises(WorkFailedError, match="not finite"):
-        solve(rows)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("frame", [4, -1])
-def test_positions_that_are_not_finite_are_refused(frame: int, value: float) -> None:
-    """The last frame is only the end of a change."""
-    scenarios = noisy_orbits(2)
-    model = StableVAR.build({"rank": 3}, info_of(scenarios))
-    scenarios[0][frame, 1, 0] = value
-    with pytest.raises(WorkFailedError):
-        model.fit(scenarios)
 
 
 def noisy_orbits(
@@ -270,33 +217,6 @@ def test_a_linear_motion_is_forecast() -> None:
     assert share < 1e-6
 
 
-def test_lags_count_from_the_latest_frame() -> None:
-    """A step is the intercept + A_1 times the last state + A_2 times the one before."""
-    scenario = noisy_orbits(1)[0]
-    info = info_of([scenario])
-    model = VAR.build({"lags": 2}, info)
-    rng = np.random.default_rng(0)
-    coefficients = rng.normal(0, 0.1, (49, 24))
-    model.coefficients.copy_(torch.from_numpy(coefficients))
-
-    given = scenario[:5]
-    start = model.start(batch_of([given]))
-    next_state = model.next_state(start).flatten().numpy()
-    states = model.states(given).astype(float)
-    before, last = states[-2:]
-    regressors = np.concatenate([[1.0], last, before])
-    expected = regressors @ model.coefficients.numpy()
-    assert_allclose(next_state, expected, atol=1e-5)
-
-
-def test_a_model_of_two_lags_starts_from_two_frames() -> None:
-    scenario = noisy_orbits(1)[0]
-    info = info_of([scenario])
-    model = VAR.build({"lags": 2}, info)
-    start = model.start(batch_of([scenario[:2]]))
-    assert start.state.shape == (1, 2, 6, 4)
-
-
 def test_one_step_of_training_and_of_a_rollout_agree() -> None:
     """The loss terms of a window are the errors of the rollout's first step."""
     scenarios = noisy_orbits(3)
@@ -329,17 +249,6 @@ def test_without_ridge_and_truncation_stable_is_plain() -> None:
     step = rolled(stable, window, 1)
     plain_step = rolled(plain, window, 1)
     torch.testing.assert_close(step, plain_step, atol=2e-5, rtol=0)
-
-
-def test_with_a_light_ridge_a_rotation_is_learned() -> None:
-    """It takes two directions of position and two of velocity."""
-    scenarios = rotations(24)
-    options = {"rank": 6, "ridge": 1e-3}
-    model = StableVAR.build(options, info_of(scenarios))
-    model.fit(scenarios)
-    new_angle = rotations(30)[-1]
-    share = share_of_persistence(model, new_angle, frames=20)
-    assert share < 0.1
 
 
 def test_a_heavy_ridge_leaves_persistence() -> None:
