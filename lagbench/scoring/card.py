@@ -11,12 +11,12 @@ import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lagbench.data.checksums import round_digits
 from lagbench.errors import UsageError, suggest_name
-from lagbench.figures.html import tag
 from lagbench.metrics.aggregate import Score, Tally
 from lagbench.metrics.frame import TaskConfig
 from lagbench.metrics.metric import Metric, mean
@@ -83,9 +83,12 @@ class ScoreCard:
             if not math.isnan(low):
                 cell += f" [{low:.3g}, {high:.3g}]"
             lines.append((f"{name} [{score.metric.unit}]", cell))
-        rows = [tag("tr", *(tag("td", cell) for cell in line)) for line in lines]
-        caption = f"{header.method} on {self.data_name}"
-        return str(tag("table", tag("caption", caption), *rows))
+        rows = []
+        for line in lines:
+            cells = "".join(f"<td>{escape(cell)}</td>" for cell in line)
+            rows.append(f"<tr>{cells}</tr>")
+        caption = escape(f"{header.method} on {self.data_name}")
+        return f"<table><caption>{caption}</caption>{''.join(rows)}</table>"
 
     @property
     def data_name(self) -> str:

@@ -23,7 +23,13 @@ from lagbench.figures.canvas import (
     figure,
     shrink,
 )
-from lagbench.figures.colours import INK, LIGHT, MATERIAL_COLOURS, MUTED, WALL
+from lagbench.figures.colours import (
+    INK,
+    MATERIAL_COLOURS,
+    MUTED,
+    SERIES,
+    WALL,
+)
 from lagbench.figures.numbers import format_quantity, sentence, words
 from lagbench.figures.solid import View
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
@@ -38,9 +44,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
-
-SERIES = tuple(LIGHT[f"c{number}"] for number in range(6))
-"""Colours of entries; further entries repeat them."""
 
 PANEL = 1.5  # side of a small panel [inch]
 ROW_NAME = 1.1  # room for the names of rows of panels [inch]
