@@ -30,7 +30,6 @@ from .full_box_parameters import FullBoxParameters
 from .shapes import Region
 from .solver import IMPLEMENTATIONS
 from .split import (
-    ClosedBoxParameters,
     FreeSurfaceParameters,
     SolverParameters,
     SplitGenerator,
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 __all__ = [
     "blamed_on_parameters",
     "check_constants",
-    "closed_box_walls",
     "constants",
     "draw_between",
     "free_surface_walls",
@@ -54,9 +52,7 @@ __all__ = [
 ]
 
 
-ParametersType = (
-    type[ClosedBoxParameters] | type[FreeSurfaceParameters] | type[FullBoxParameters]
-)
+ParametersType = type[FreeSurfaceParameters] | type[FullBoxParameters]
 
 _POSITIVE = Limit(low=0.0, open_low=True)
 _NOT_NEGATIVE = Limit(low=0.0)
@@ -167,8 +163,7 @@ def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) ->
         is_possible = limit.holds(value)
         expected = str(limit)
     if field.name == "wall" and is_possible:
-        # Between the walls lie four cells at least; three in a closed box, whose walls
-        # lie half-way between nodes.
+        # Between the walls lie four cells at least.
         high = (int(str(values["grid"])) - 4) // 2
         limit = Limit(low=0, high=high, whole=True)
         is_possible = limit.holds(value)
@@ -249,7 +244,7 @@ def _list_texts(size: Size) -> str:
     return f"; parameters that are no numbers: {', '.join(texts)}"
 
 
-Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters, FullBoxParameters)
+Kind = TypeVar("Kind", FreeSurfaceParameters, FullBoxParameters)
 
 
 def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:
@@ -261,12 +256,6 @@ def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:
     values.update(fixed)
     check_constants(kind, values, size)
     return kind(**values)
-
-
-def closed_box_walls(size: Size) -> tuple[float, float]:
-    """Return the low and high wall, half-way between two nodes [length]."""
-    low = (float(size.value("wall")) + 0.5) / size.grid
-    return low, 1.0 - low
 
 
 def free_surface_walls(size: Size) -> tuple[float, float]:

@@ -17,7 +17,6 @@ from . import backend
 from .full_box_parameters import FullBoxParameters
 from .solver import Health, Singles
 from .split import (
-    ClosedBoxParameters,
     Device,
     FreeSurfaceParameters,
     InitialState,
@@ -25,9 +24,7 @@ from .split import (
 )
 from .transfer import Nothing, Template
 
-Parameters = TypeVar(
-    "Parameters", ClosedBoxParameters, FreeSurfaceParameters, FullBoxParameters
-)
+Parameters = TypeVar("Parameters", FreeSurfaceParameters, FullBoxParameters)
 
 
 class Field(Protocol):

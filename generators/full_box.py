@@ -1,6 +1,6 @@
 """Weakly compressible flow in a full box: two or three axes, walled or periodic.
 
-Equations and the bounds within which they hold stand in :mod:`.nodal_stress_nd`, the
+Equations and the bounds within which they hold stand in :mod:`.nodal_stress`, the
 rules of walls and periodic axes in :mod:`.box_tables`.
 """
 
@@ -14,8 +14,7 @@ from lagbench.errors import UsageError
 from .box_tables import LANES, Singles
 from .driver import Driver, check_no_friction, check_program
 from .full_box_parameters import FullBoxParameters
-from .nodal_stress import broken_jacobian_bounds
-from .nodal_stress_nd import NodalStressND
+from .nodal_stress import NodalStress, broken_jacobian_bounds
 from .obstacle import Obstacle, is_inside
 from .solver import Health
 from .split import InitialState
@@ -31,10 +30,10 @@ class FullBox(Driver[FullBoxParameters]):
     fluid. Nobody else sees them.
     """
 
-    _kernels: NodalStressND
+    _kernels: NodalStress
 
-    def _compile(self, atomic: bool, threads: int) -> NodalStressND:
-        return NodalStressND(
+    def _compile(self, atomic: bool, threads: int) -> NodalStress:
+        return NodalStress(
             self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
         )
 
@@ -98,13 +97,18 @@ class FullBox(Driver[FullBoxParameters]):
                 rows[:, : self.dimension] = obstacle.position
         return position
 
+    def move_walls(self, velocity: Singles) -> None:
+        """Let walls slide [length/s], shape [scenario, 2 axis, axis]; with a program,
+        up to its next frame.
+        """
+        self._kernels.move_walls(velocity)
+
     def _drive_towards(self, frame: int) -> None:
         """Set walls and forces as they act up to a frame."""
         kernels = self._kernels
         walls = [state.walls_towards(frame) for state in self._states]
         exact_velocity = np.stack(walls)
-        wall_velocity = exact_velocity.astype(np.float32)
-        kernels.move_walls(wall_velocity)
+        self.move_walls(exact_velocity.astype(np.float32))
         if self.parameters.force_layers:
             forces = [state.force_towards(frame) for state in self._states]
             exact_force = np.stack(forces)

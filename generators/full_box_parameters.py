@@ -20,7 +20,7 @@ __all__ = ["FullBoxParameters"]
 class FullBoxParameters:
     """Constants of the weakly compressible solver of a full box.
 
-    The equations stand in :mod:`.nodal_stress_nd`. Nodes are the middles of cells; the
+    The equations stand in :mod:`.nodal_stress`. Nodes are the middles of cells; the
     box is a whole number of cells long along each axis.
     """
 

@@ -1,63 +1,80 @@
 """One substep of weakly compressible flow whose stress acts at the nodes.
 
-The walls lie half-way between nodes; beyond each is one layer of ghost nodes, the
-mirror images of the outermost interior nodes. Per substep, for particles of equal mass
-m, positions x_p, grid spacing dx and weights w_ip:
+In two or three dimensions, with a force f per mass that acts at the nodes. Nodes are
+the middles of cells; beyond each wall is one layer of ghost nodes, the mirror images of
+the outermost interior nodes, and beyond an end of a periodic axis the nodes of the
+other end (:mod:`.box_tables`). Per substep, for particles of equal mass m, positions
+x_p, grid spacing dx and weights w_ip:
 
 1. P2G: n_i = sum w,  (n J)_i = sum w J_p,  (n v)_i = sum w (v_p + C_p (x_i - x_p)).
 2. Fold: ghosts give what they received to their mirror images, normal momentum
    reversed, tangential momentum n (2 u_wall - v) at a no-slip wall and n v at a
    free-slip wall. Then v = (n v)/n,  Jbar = (n J)/n,  relative density
-   r = n m / (rho dx^2); ghosts mirror them.
-3. Forces: a = (E/rho) grad Jbar + nu lap v,  v <- v + dt a; ghosts mirror v and a.
+   r = n m / (rho dx^d); ghosts mirror them.
+3. Forces: a = (E/rho) grad Jbar + nu lap v + f,  v <- v + dt a; ghosts mirror v and a.
+   Gradients are central differences, weighted 1/8, 3/4, 1/8 along every other axis. In
+   a fringe f also holds sigma (U - v), which draws the velocity to the stream U
+   (Nordstrom, Nordin and Henningson, SIAM J. Sci. Comput. 20 (1999) 1365). Nodes
+   inside an obstacle are at rest: v = 0, a = 0.
 4. G2P: v* = sum w v,  a* = sum w a,  r = max(sum w r, 1/2),
    grad q = (4/dx^2) sum w q (x_i - x_p),  C = grad v,
    shift s = -beta dx^2 grad(r)/r, each component within 0.1 dx,
    v_p <- (v_p + dt a*) + lambda (v* - v_p - dt a*) + C s,
-   x_p <- x_p + dt v* + s, kept in the box,
+   x_p <- x_p + dt v* + s, kept between walls and wrapped along periodic axes,
    J_p <- J_p (1 + dt tr C) + kappa (Jbar - J_p) + theta (1/r - Jbar).
+   Particles of the fluid that would enter an obstacle are put on its surface. Those of
+   an obstacle neither move nor get a velocity, but their J follows that of the nodes,
+   so that the pressure goes on inside.
 
 The mass of a particle cancels everywhere but in r, so nodes count particles, n, and no
 sum is tiny. Sums are integers (:mod:`.transfer`): no order of particles or threads
-changes a bit.
+changes a bit. The numbers n are summed in rows of three nodes, so that P2G adds vectors
+of four throughout: component k of ``rows`` at a node counts for the k-th node from
+there along the last axis.
 
 Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and while J
 stays in (0, 8]. Settings that reproduce Ghia, Ghia & Shin (1982) are those of the split
 ``cavity``.
 """
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import taichi as ti
-from taichi import f32, f64, i32, i64
-from taichi.math import vec2, vec4
+from numpy.typing import NDArray
+from taichi import f32, i32, i64
+from taichi.math import vec3, vec4
 
 from . import backend
-from .split import ClosedBoxParameters
+from .box_tables import LANES, BoxTables, Singles
+from .full_box_parameters import FullBoxParameters
+from .obstacle import Obstacle, is_inside
 from .transfer import (
     Nothing,
     Template,
     Value,
-    accumulate,
-    base_node,
+    add_shifted,
     bounded,
     fixed_point_scale,
     from_fixed,
     largest,
-    masked,
-    stencil,
+    node_number,
+    row_count,
+    spline_weights,
     stepped,
 )
-from .walls import Walls
 
 JACOBIAN_BOUND = 8.0  # largest J that the sums have room for [1]
 _INSET = 1e-3  # distance that particles keep from a wall [cells]
-_REACH = 16.0
-"""Bound of abs(v_p + C (x_i - x_p)) over the speed bound dx/dt [1].
+_ROW = (0, 1, 2)  # the nodes of a row
+_REACH = {2: 16.0, 3: 32.0}
+"""Bound of abs(v_p + C (x_i - x_p)) over the speed bound dx/dt [1], by dimension.
 
 Walls move at half the bound or less, so ghosts at twice the bound or less; abs(C_ab) <=
 (4/dx^2) max abs(v) sum w abs(x_i - x_p) <= 4/dt, and a node lies within 1.5 dx per
-axis: 1 + 2 x 4 x 1.5 = 13.
+axis: 1 + 2 x 4 x 1.5 = 13, and 1 + 3 x 4 x 1.5 = 19 in three dimensions.
 """
 
 
@@ -75,621 +92,1086 @@ def broken_jacobian_bounds(lowest: float, highest: float) -> dict[str, str]:
 class NodalStress:
     """Fields of a batch of scenarios and the kernels that advance them."""
 
-    at_rest = (0.0, 0.0, 1.0, 1.0)  # state of a particle at rest
-
     def __init__(
         self,
-        parameters: ClosedBoxParameters,
+        parameters: FullBoxParameters,
         *,
         scenarios: int,
         atomic: bool,
         threads: int,
     ) -> None:
-        """Compute the constants of the scheme and allocate the fields."""
+        """Round the constants, make the tables and take the memory."""
         p = parameters
+        box = p.box
         dx = 1.0 / p.grid
-        low_wall = p.wall + 0.5  # coordinates of the walls [cells]
-        high_ghost = p.grid - p.wall
-        high_wall = high_ghost - 0.5
         self.parameters = parameters  # constants that the scenarios share
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
-        # whether the velocities of the coming substeps are summed, for their mean
-        self.averaging = False
-        self.walls = Walls(grid=p.grid, wall=p.wall, no_slip=p.no_slip)
-        self.particles = p.particles
+
+        dimension = box.dimension
+        self.dimension = dimension
+        self.axes = tuple(range(dimension))
+        self.has_z = dimension == 3
+        self.periodic = box.periodic
+        self.has_walls = not all(self.periodic)
+        self.has_obstacle = p.obstacle_particles > 0
+        self.has_fringe = p.fringe_rate > 0.0
+        self.has_force = p.force_layers > 0
+        # particles of the fluid, and behind them those of the obstacle
+        self.particles = p.particles + p.obstacle_particles
+        # the field of forces has a layer even where no force acts
+        self.layer_count = max(1, p.force_layers)
+
+        self.cells = p.cells
+        tables = BoxTables(p.cells, periodic=box.periodic, no_slip=p.no_slip)
+        self.tables = tables
+        self.stride = tables.stride
+        image_signs = tables.images.sign
+        self.image_signs = image_signs.tolist()
+        image_count = len(self.image_signs)
+        self.image_numbers = tuple(range(image_count))
+
         self.inv_dx = float(p.grid)
-        self.width = p.grid + 1
-        self.node_count = self.width**2
         self.dt = p.dt
-        # smallest and largest coordinate of a particle [length]
-        lowest_place = low_wall + _INSET  # [cells]
-        highest_place = high_wall - _INSET
-        self.position_min = lowest_place * dx
-        self.position_max = highest_place * dx
+        self.origin = p.origin  # coordinate of node 0 of each axis [cells]
+        # smallest and largest coordinate of a particle along each axis
+        wall_inset = _INSET * dx
+        inset = np.where(box.periodic, 0.0, wall_inset)
+        low_faces = np.array(box.low)
+        high_faces = np.array(box.high)
+        position_min = low_faces + inset
+        position_max = high_faces - inset
+        self.position_min = position_min.tolist()
+        self.position_max = position_max.tolist()
+        period = box.lengths
+        self.period = period.tolist()
+
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
-        reach_bound = _REACH * self.speed_bound
-        self.velocity_scale = fixed_point_scale(p.particles, reach_bound)
-        self.count_scale = fixed_point_scale(p.particles, JACOBIAN_BOUND)
-        self.velocity_unit = 1.0 / self.velocity_scale
-        self.count_unit = 1.0 / self.count_scale
-        self.cell_scale = self.velocity_scale * dx
+        reach = _REACH[dimension]
+        speed_reach = reach * self.speed_bound
+        particles = self.particles
+        velocity_scale = fixed_point_scale(particles, speed_reach)
+        count_scale = fixed_point_scale(particles, JACOBIAN_BOUND)
+        self.velocity_scale = velocity_scale
+        self.count_scale = count_scale
+        self.velocity_unit = 1.0 / velocity_scale
+        self.count_unit = 1.0 / count_scale
+        self.cell_scale = velocity_scale * dx
+
         # dt E / (2 rho dx): gain of velocity by a difference of Jbar over two cells
-        divisor = p.density * 2.0 * dx
-        impulse = p.dt * p.modulus
-        self.pressure_factor = impulse / divisor
+        double_density = p.density * 2.0
+        divisor = double_density * dx
+        timed_modulus = p.dt * p.modulus
+        self.pressure_factor = timed_modulus / divisor
         self.slope_factor = 4.0 * self.inv_dx  # 4/dx
-        minus_shift_length = -p.shift * dx
-        self.shift_factor = minus_shift_length * dx  # -beta dx^2
+        # -beta dx^2
+        shift_per_cell = -p.shift * dx
+        self.shift_factor = shift_per_cell * dx
         self.shift_bound = 0.1 * dx
+
+        self._make_stencils()
         self._declare_fields()
         self._tree = self._place_fields()
+        self._fill_tables()
+
+    def _make_stencils(self) -> None:
+        """List the rows that a particle touches, the pairs of a node's neighbours, and
+        the weights of the pairs in a gradient.
+
+        The kernels unroll them.
+        """
+        dimension = self.dimension
+        # the rows of three nodes that a particle touches: steps along all but the last
+        # axis
+        row_axes = dimension - 1
+        self.row_axes = tuple(range(row_axes))
+        row_steps = itertools.product((-1, 0, 1), repeat=row_axes)
+        self.row_steps = tuple(row_steps)
+
+        # one of each pair of opposite neighbours; nearest first
+        pairs = []
+        middle = (0,) * dimension
+        all_steps = itertools.product((1, 0, -1), repeat=dimension)
+        for step in all_steps:
+            if step > middle:
+                pairs.append(step)
+        pairs.sort(key=_axis_count)
+        self.pairs = tuple(pairs)
+        # the two of these differ along one axis only
+        self.nearest_pairs = self.pairs[:dimension]
+
+        # weight in a gradient of the difference of a pair, by the number of further
+        # axes along which the two differ
+        weights = []
+        for further in range(dimension):
+            equal_axes = row_axes - further
+            equal_weight = 0.75**equal_axes
+            further_weight = 0.125**further
+            weight = equal_weight * further_weight
+            weights.append(weight)
+        self.pair_weight = tuple(weights)
+        self.further_counts = tuple(range(1, dimension))
 
     def _declare_fields(self) -> None:
         """Name the fields; they have no memory yet."""
-        # of each particle: its position [length], and two zeros
-        self.x = vec4.field()
-        # what P2G spreads: v_x, v_y, 1, J
-        self.particle_state = vec4.field()
-        # v_x, v_y, r and Jbar of the nodes, at the particle
-        self.grid_state = vec4.field()
-        # d/dx of the same
-        self.slope_x = vec4.field()
-        # d/dy of the same
-        self.slope_y = vec4.field()
-        self.slopes = (self.slope_x, self.slope_y)
-        # dt a of the nodes, at the particle, and two zeros
-        self.grid_gain = vec4.field()
-        # largest abs(v_x), abs(v_y), J and -J since the advance began
-        self.extremes = vec4.field()
-        # rows of its stencil
-        self.first_row = vec4.field()
-        self.second_row = vec4.field()
-        self.third_row = vec4.field()
-        self.weight_rows = [self.first_row, self.second_row, self.third_row]
+        # of each particle: its position [length], and the largest -J since the
+        # advance began
+        self.x = _vector_field()
+        self.particle_state = _vector_field()  # v_p, J_p
+        # state of a particle at rest
+        self.at_rest = (0.0, 0.0, 0.0, 1.0)
+        # v and r of the nodes, at the particle
+        self.grid_state = _vector_field()
+        # derivative of the same along each axis
+        self.slopes = [_vector_field() for _ in self.axes]
+        # dt a and Jbar of the nodes, at the particle
+        self.grid_gain = _vector_field()
+        # largest abs(v) by component, and largest J, since the advance began
+        self.extremes = _vector_field()
+        # the three weights along each axis
+        self.weights = [_vector_field() for _ in self.axes]
+        # offset from the middle node [cells], and the bits of the lowest node's number
+        self.stencil_place = _vector_field()
 
-        # of each node: n v_x, n v_y, n, n J
-        self.sums = ti.Vector.field(4, i64)
-        # v_x, v_y, r, Jbar before the forces of this substep
-        self.node_state = vec4.field()
-        # the same after them
-        self.next_state = vec4.field()
-        self.node_gain = vec2.field()  # dt a
+        # of each node: n v, n J
+        self.sums = _sum_field()
+        self.weight_sum = ti.field(i64)  # n
+        self.drag = _vector_field()  # what moving walls add to n v
+        self.node_state = _vector_field()  # v, r
+        self.node_jacobian = _number_field()  # Jbar
+        self.next_state = _vector_field()  # v, r after the forces
+        self.node_gain = _vector_field()  # dt a, Jbar
         # largest absolute velocity component since the advance began
-        self.peak_speed = ti.field(f32)
-        # sum over time of the velocity
-        self.velocity_sum = ti.Vector.field(2, f64)
+        self.peak_speed = _number_field()
+        # 1 in the fluid, 0 inside an obstacle
+        self.fluid_mask = _number_field()
+        # dt sigma, equal in all scenarios
+        self.fringe_damping = _number_field()
+        self.force_layer = _index_field()
+        # n of three nodes in a row
+        self.row_sums = _sum_field()
 
-        # of each scenario: nu dt / dx^2 and m / (rho dx^2)
-        self.diffusion_number = ti.field(f32)
-        self.particle_volume = ti.field(f32)
+        # of each scenario: nu dt / dx^2 and m / (rho dx^d)
+        self.diffusion_number = _number_field()
+        self.particle_volume = _number_field()
+        # centre of the obstacle, and the least distance from it [length]
+        self.obstacle = _vector_field()
+        self.stream = _vector_field()  # U
+
+        # tables, shape [ghost], [edge], [edge, image] and [interior]
+        self.ghost_node = _index_field()
+        self.ghost_source = _index_field()
+        self.ghost_sign = _vector_field()
+        self.edge_node = _index_field()
+        self.image_ghost = _index_field()
+        self.interior_node = _index_field()
+        # what walls and forces do now, shape [scenario, ghost], [scenario, edge,
+        # image] and [scenario, layer]
+        self.ghost_drive = _vector_field()  # added to a ghost's v
+        self.image_drag = _vector_field()  # n v per particle
+        self.force_gain = _vector_field()  # dt f
 
     def _place_fields(self) -> Any:  # noqa: ANN401 (Taichi is untyped)
         """Give the fields their memory, each an array of its own."""
         particle_fields = (
             self.x,
             self.particle_state,
-            self.slope_x,
-            self.slope_y,
-            *self.weight_rows,
+            *self.slopes,
+            self.extremes,
+            *self.weights,
+            self.stencil_place,
             self.grid_state,
             self.grid_gain,
-            self.extremes,
         )
         node_fields = (
             self.sums,
+            self.weight_sum,
+            self.drag,
             self.node_state,
             self.next_state,
+            self.node_jacobian,
             self.node_gain,
             self.peak_speed,
-            self.velocity_sum,
         )
-        scenario_fields = [
-            self.walls.speed,
+        ghost_fields = (self.ghost_node, self.ghost_source, self.ghost_sign)
+        scenario_fields = (
             self.diffusion_number,
             self.particle_volume,
-        ]
-        particle_shape = (self.scenarios, self.particles)
-        node_shape = (self.scenarios, self.node_count)
-        scenario_shape = (self.scenarios,)
+            self.obstacle,
+            self.stream,
+        )
+        tables = self.tables
+        scenarios = self.scenarios
+        node_count = tables.node_count
+        ghost_count = len(tables.ghosts.node)
+        edge_count = len(tables.images.node)
+        image_shape = tables.images.ghost.shape
+        interior_shape = tables.interior.shape
+        particle_shape = (scenarios, self.particles)
+        node_shape = (scenarios, node_count)
+        # Two more: a node counts the rows of the two nodes before it as well.
+        row_shape = (scenarios, node_count + 2)
+        drive_shape = (scenarios, ghost_count)
+        drag_shape = (scenarios, *image_shape)
+        force_shape = (scenarios, self.layer_count)
+        mask_shape = (1, 1)
+        if self.has_obstacle:
+            mask_shape = node_shape
+        fringe_count = 1
+        if self.has_fringe:
+            fringe_count = node_count
         return backend.place(
             (particle_shape, particle_fields),
             (node_shape, node_fields),
-            (scenario_shape, scenario_fields),
+            (row_shape, [self.row_sums]),
+            ((ghost_count,), ghost_fields),
+            ((edge_count,), [self.edge_node]),
+            (image_shape, [self.image_ghost]),
+            (interior_shape, [self.interior_node]),
+            ((node_count,), [self.force_layer]),
+            (drive_shape, [self.ghost_drive]),
+            (drag_shape, [self.image_drag]),
+            (force_shape, [self.force_gain]),
+            ((scenarios,), scenario_fields),
+            (mask_shape, [self.fluid_mask]),
+            ((fringe_count,), [self.fringe_damping]),
         )
+
+    def _fill_tables(self) -> None:
+        tables = self.tables
+        ghosts = tables.ghosts
+        images = tables.images
+        self.ghost_node.from_numpy(ghosts.node)
+        self.ghost_source.from_numpy(ghosts.source)
+        self.ghost_sign.from_numpy(ghosts.sign)
+        self.edge_node.from_numpy(images.node)
+        self.image_ghost.from_numpy(images.ghost)
+        self.interior_node.from_numpy(tables.interior)
+
+        # the layer of each node along y; ghosts belong to the nearest one
+        row_count = self.cells[1]
+        last_row = row_count - 1
+        row_with_ghosts = tables.index[:, 1]
+        row = row_with_ghosts - 1
+        row = np.clip(row, 0, last_row)
+        scaled_row = row * self.layer_count
+        layer = scaled_row // row_count
+        layer_number = layer.astype(np.int32)
+        self.force_layer.from_numpy(layer_number)
+
+        if self.has_fringe:
+            places = self._node_places()
+            x = places[:, 0]
+            rates = self.parameters.fringe_rates(x)
+            damping = self.dt * rates
+            rounded_damping = damping.astype(np.float32)
+            self.fringe_damping.from_numpy(rounded_damping)
+
+    def _node_places(self) -> NDArray[np.float64]:
+        """Return where the nodes lie [length], ghosts included, shape [node, axis]."""
+        origin = np.array(self.origin)
+        cells = self.tables.index + origin
+        places = cells / self.inv_dx
+        return np.asarray(places)
+
+    def move_walls(self, velocity: Singles) -> None:
+        """Let walls slide [length/s], shape [scenario, 2 axis, axis]."""
+        drive = self.tables.ghost_drive(velocity)
+        drag = self.tables.image_drag(velocity)
+        self.ghost_drive.from_numpy(drive)
+        self.image_drag.from_numpy(drag)
+
+    def apply_force(self, acceleration: Singles) -> None:
+        """Let a force act [length/s^2], shape [scenario, layer, axis]."""
+        scenarios, layers, dimension = acceleration.shape
+        dt = np.float32(self.dt)
+        velocity_gain = dt * acceleration
+        shape = (scenarios, layers, LANES)
+        gain = np.zeros(shape, np.float32)
+        gain[..., :dimension] = velocity_gain
+        self.force_gain.from_numpy(gain)
+
+    def place_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Set the nodes that each scenario's obstacle holds at rest."""
+        places = self._node_places()
+        node_count = len(places)
+        mask_shape = (self.scenarios, node_count)
+        disc_shape = (self.scenarios, LANES)
+        mask = np.empty(mask_shape, np.float32)
+        discs = np.zeros(disc_shape, np.float32)
+        inset = _INSET / self.inv_dx
+        for s, obstacle in enumerate(obstacles):
+            centre = obstacle.centre
+            radius = obstacle.radius
+            is_solid = is_inside(places, centre, radius)
+            mask[s] = ~is_solid
+            disc = discs[s]
+            disc[: self.dimension] = centre
+            least_distance = radius + inset
+            disc[3] = least_distance
+        self.fluid_mask.from_numpy(mask)
+        self.obstacle.from_numpy(discs)
+
+    def set_stream(self, velocity: Singles) -> None:
+        """Let the fringe draw to a velocity [length/s], shape [scenario, axis]."""
+        shape = (self.scenarios, LANES)
+        stream = np.zeros(shape, np.float32)
+        stream[:, : self.dimension] = velocity
+        self.stream.from_numpy(stream)
 
     def release(self) -> None:
         """Give the memory back; the fields cannot be used afterwards."""
         self._tree.destroy()
 
-    @ti.func
-    def at(self, i: i32, j: i32) -> i32:
-        """Return the number of a node."""
-        column = i * self.width
-        return column + j
-
-    @ti.func
-    def state_at(self, s: i32, i: i32, j: i32) -> vec4:
-        """Return v_x, v_y, r and Jbar of a node before the forces."""
-        node = self.at(i, j)
-        return self.node_state[s, node]
-
-    @ti.func
-    def jacobian_at(self, s: i32, i: i32, j: i32) -> f32:
-        """Return Jbar of a node before the forces."""
-        state = self.state_at(s, i, j)
-        return state[3]
-
     # The phases: each function is one phase at one particle or node.
 
     @ti.func
-    def clear(self, s: i32, i: i32, j: i32) -> None:
-        """Set the sums of a node of scenario s to zero, before P2G adds to them."""
-        node = self.at(i, j)
-        zero = ti.Vector.zero(i64, 4)
-        self.sums[s, node] = zero
+    def clear(self, s: i32, n: i32) -> None:
+        """Set a node's sums to zero."""
+        zero = ti.Vector.zero(i64, LANES)
+        self.sums[s, n] = zero
+        row = n + 2
+        self.row_sums[s, row] = zero
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
-        """Keep for P2G and G2P which nodes a particle touches, and the weights."""
-        position = self.x[s, p]
-        first, second, third = stencil(position, self.inv_dx, self.width)
-        self.first_row[s, p] = first
-        self.second_row[s, p] = second
-        self.third_row[s, p] = third
+        """Store the stencil of a particle for P2G and G2P: its nodes and weights."""
+        x = self.x[s, p]
+        number = 0
+        offset = vec3(0.0)
+        for axis in ti.static(self.axes):
+            origin = self.origin[axis]
+            cells = self.cells[axis]
+            last_cell = cells - 1
+            coordinate = x[axis]
+            from_zero = coordinate * self.inv_dx  # [cells]
+            scaled = from_zero - origin
+            half_below = scaled - 0.5
+            lowest = ti.cast(half_below, i32)
+            # A periodic coordinate may round up to the end of its last cell.
+            lowest = ti.min(lowest, last_cell)
+            node = ti.cast(lowest, f32)
+            f = scaled - node
+            low, mid, high = spline_weights(f)
+            weights = vec4(low, mid, high, 0.0)
+            self.weights[axis][s, p] = weights
+            from_middle = f - 1.0
+            offset[axis] = from_middle
+            stride = self.stride[axis]
+            nodes_before = lowest * stride
+            number += nodes_before
+        number_bits = ti.bit_cast(number, f32)
+        place = vec4(offset, number_bits)
+        self.stencil_place[s, p] = place
+
+    @ti.func
+    def lowest_node(self, place: vec4) -> i32:
+        """Return the number of the lowest node of a particle's stencil."""
+        number_bits = place[3]
+        return node_number(number_bits, self.tables.node_count)
+
+    @ti.func
+    def load_along(self, fields: Template, s: i32, p: i32) -> Value:
+        """Return a particle's vectors in three fields: one field for each of x, y, z.
+
+        In two dimensions the third is zero. Callers load before they write anything:
+        LLVM cannot know that the fields do not overlap, and would read again after each
+        write.
+        """
+        first = fields[0][s, p]
+        second = fields[1][s, p]
+        third = vec4(0.0)
+        if ti.static(self.has_z):
+            third = fields[2][s, p]
+        return first, second, third
+
+    @ti.func
+    def row_weights(
+        self, weight_x: vec4, weight_y: vec4, weight_z: vec4, step: Template
+    ) -> Value:
+        """Return the weights of the three nodes of a row, and a zero."""
+        across = weight_x[step[0] + 1]
+        weights = across * weight_y
+        if ti.static(self.has_z):
+            along_y = weight_y[step[1] + 1]
+            across = across * along_y
+            weights = across * weight_z
+        return weights
+
+    @ti.func
+    def row_start(self, lowest: i32, step: Template) -> i32:
+        """Return the number of the first node of a row."""
+        number = lowest
+        for axis in ti.static(self.row_axes):
+            stride = self.stride[axis]
+            steps_from_low = step[axis] + 1
+            nodes_before = steps_from_low * stride
+            number += nodes_before
+        return number
 
     @ti.func
     def p2g(self, s: i32, p: i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.weight_rows, s, p)
-        scale = vec4(
-            self.velocity_scale,
-            self.velocity_scale,
-            self.count_scale,
-            self.count_scale,
-        )
-        # n and J have no slope; a product with 0 is one, as nodes, and so slopes, are
-        # finite.
-        cell_scale = self.cell_scale
-        slope_scale = vec4(cell_scale, cell_scale, 0.0, 0.0)
-        # what is added from one node to the next, along x and along y
-        slope_x = self.slope_x[s, p]
+        place = self.stencil_place[s, p]
+        lowest = self.lowest_node(place)
+        weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
+        slope_x, slope_y, slope_z = self.load_along(self.slopes, s, p)
+        # Weights carry the scale of n and J, so that v lacks the rest of its own. All
+        # are powers of two, which round nothing.
+        weight_x = self.count_scale * weight_x
+        rest = self.velocity_scale / self.count_scale
+        scale = vec4(rest, rest, rest, 1.0)
+        # J has no slope; a product with 0 is one, as nodes, and so slopes, are finite.
+        cell = self.cell_scale / self.count_scale
+        slope_scale = vec4(cell, cell, cell, 0.0)
         step_x = slope_scale * slope_x
-        slope_y = self.slope_y[s, p]
         step_y = slope_scale * slope_y
+        step_z = slope_scale * slope_z
 
-        state = self.particle_state[s, p]
-        at_particle = scale * state
-        change_x = offset.x * step_x
-        at_middle = at_particle - change_x
-        change_y = offset.y * step_y
-        at_middle = at_middle - change_y
-        for i in ti.static(range(3)):
-            column = base + i * self.width
-            at_column = stepped(at_middle, step_x, i - 1)
-            for j in ti.static(range(3)):
-                at_node = stepped(at_column, step_y, j - 1)
-                node = column + j
-                # A weight at a time: a name for the row makes this loop slower.
-                weight = self.weight_rows[i][s, p][j]
+        particle_state = self.particle_state[s, p]
+        at_particle = scale * particle_state
+        way_x = place.x * step_x
+        way_y = place.y * step_y
+        at_middle = at_particle - way_x
+        at_middle = at_middle - way_y
+        if ti.static(self.has_z):
+            way_z = place.z * step_z
+            at_middle = at_middle - way_z
+
+        for step in ti.static(self.row_steps):
+            weights = self.row_weights(weight_x, weight_y, weight_z, step)
+            start = self.row_start(lowest, step)
+            at_row = stepped(at_middle, step_x, step[0])
+            row_step = step_y
+            if ti.static(self.has_z):
+                at_row = stepped(at_row, step_y, step[1])
+                row_step = step_z
+            for k in ti.static(_ROW):
+                node = start + k
+                weight = weights[k]
+                at_node = stepped(at_row, row_step, k - 1)
                 share = weight * at_node
-                accumulate(self.sums, s, node, share, self.atomic)
+                add_shifted(self.sums, s, node, share, self.atomic)
+            # The fourth weight is 0, so that the fourth sum counts shifts.
+            last = start + 2
+            add_shifted(self.row_sums, s, last, weights, self.atomic)
 
     @ti.func
-    def received(self, s: i32, i: i32, j: i32) -> Value:
-        """Return the sums of a node and its mirror images, and the drag of the walls.
-
-        The drag is the momentum that moving walls add.
-        """
-        node = self.at(i, j)
-        total = self.sums[s, node]
-        drag = vec2(0.0)
-        ghost_i = self.walls.beyond(i)
-        ghost_j = self.walls.beyond(j)
-        is_beside_x_wall = ghost_i != i
-        is_beside_y_wall = ghost_j != j
-        # signs of n v_x, n v_y, n and n J in the image across an x wall, and a y wall
-        tangential = self.walls.tangential
-        x_sign = ti.Vector([-1, tangential, 1, 1])
-        y_sign = ti.Vector([tangential, -1, 1, 1])
-
-        # Walls across x slide along y, and the other way round.
-        if is_beside_x_wall:
-            ghost = self.at(ghost_i, j)
-            image = self.sums[s, ghost]
-            reflected = x_sign * image
-            total += reflected
-            count_sum = image[2]
-            count = from_fixed(count_sum, self.count_unit)
-            speed_y = self.walls.doubled_speed(s, 0, ghost_i)
-            momentum_y = speed_y * count
-            drag.y += momentum_y
-        if is_beside_y_wall:
-            ghost = self.at(i, ghost_j)
-            image = self.sums[s, ghost]
-            reflected = y_sign * image
-            total += reflected
-            count_sum = image[2]
-            count = from_fixed(count_sum, self.count_unit)
-            speed_x = self.walls.doubled_speed(s, 2, ghost_j)
-            momentum_x = speed_x * count
-            drag.x += momentum_x
-        if is_beside_x_wall and is_beside_y_wall:
-            ghost = self.at(ghost_i, ghost_j)
-            image = self.sums[s, ghost]
-            corner_sign = x_sign * y_sign
-            reflected = corner_sign * image
-            total += reflected
-            count_sum = image[2]
-            count = from_fixed(count_sum, self.count_unit)
-            speed_x = self.walls.doubled_speed(s, 2, ghost_j)
-            speed_y = self.walls.doubled_speed(s, 0, ghost_i)
-            momentum_x = speed_x * count
-            momentum_y = speed_y * count
-            drag.x += momentum_x
-            drag.y += momentum_y
-        return total, drag
+    def settle(self, s: i32, n: i32) -> None:
+        """Take the shifts off a node's sums, and add up its n from three rows."""
+        weight_sum, shifts = row_count(self.row_sums, s, n)
+        shifted_total = self.sums[s, n]
+        total = shifted_total - shifts
+        self.sums[s, n] = total
+        self.weight_sum[s, n] = weight_sum
 
     @ti.func
-    def fold(self, s: i32, i: i32, j: i32, particle_volume: f32) -> None:
+    def image_sign(self, k: Template) -> Value:
+        """Return the signs with which the k-th image of a node counts for (v, J)."""
+        signs = ti.static(self.image_signs[k])
+        return ti.Vector(signs, i64)
+
+    @ti.func
+    def add_images(self, s: i32, e: i32) -> None:
+        """Add to a node beside ghosts what its images received, and the walls' drag."""
+        n = self.edge_node[e]
+        total = self.sums[s, n]
+        weight_sum = self.weight_sum[s, n]
+        drag = vec4(0.0)
+        for k in ti.static(self.image_numbers):
+            ghost = self.image_ghost[e, k]
+            if ghost >= 0:
+                ghost_weight = self.weight_sum[s, ghost]
+                ghost_total = self.sums[s, ghost]
+                sign = self.image_sign(k)
+                mirrored_total = sign * ghost_total
+                total += mirrored_total
+                weight_sum += ghost_weight
+                if ti.static(self.has_walls):
+                    ghost_count = from_fixed(ghost_weight, self.count_unit)
+                    drag_per_particle = self.image_drag[s, e, k]
+                    wall_drag = drag_per_particle * ghost_count
+                    drag += wall_drag
+        self.sums[s, n] = total
+        self.weight_sum[s, n] = weight_sum
+        self.drag[s, n] = drag
+
+    @ti.func
+    def fold(self, s: i32, n: i32, particle_volume: f32) -> None:
         """Turn the sums of an interior node into v, r and Jbar."""
-        velocity = vec2(0.0)
-        density = 0.0
+        state = vec4(0.0)
         jacobian = 1.0
-
-        total, drag = self.received(s, i, j)
-        momentum_sum = total.xy
-        count_sum = total[2]
-        jacobian_sum = total[3]
-        if count_sum > 0:
-            momentum = from_fixed(momentum_sum, self.velocity_unit)
-            momentum = momentum + drag
-            count = from_fixed(count_sum, self.count_unit)
-            count_times_jacobian = from_fixed(jacobian_sum, self.count_unit)
-            velocity = momentum / count
+        weight_sum = self.weight_sum[s, n]
+        if weight_sum > 0:
+            total = self.sums[s, n]
+            jacobian_total = total[3]
+            count = from_fixed(weight_sum, self.count_unit)
+            received = from_fixed(total, self.velocity_unit)
+            drag = self.drag[s, n]
+            momentum = received + drag
+            state = momentum / count
             density = count * particle_volume
-            jacobian = count_times_jacobian / count
-
-        node = self.at(i, j)
-        state = vec4(velocity, density, jacobian)
-        self.node_state[s, node] = state
-
-    @ti.func
-    def source(self, i: i32, j: i32) -> i32:
-        """Return the number of the interior node that a ghost node mirrors."""
-        source_i = self.walls.source(i)
-        source_j = self.walls.source(j)
-        return self.at(source_i, source_j)
+            state[3] = density
+            jacobian_sum = from_fixed(jacobian_total, self.count_unit)
+            jacobian = jacobian_sum / count
+        self.node_state[s, n] = state
+        self.node_jacobian[s, n] = jacobian
 
     @ti.func
-    def mirror(self, states: Template, s: i32, k: i32) -> None:
-        """Fill the k-th ghost node of (v, r, Jbar).
-
-        r and Jbar are even about the wall, v is odd about the velocity of the wall.
-        """
-        i, j = self.walls.ring(k)
-        source = self.source(i, j)
-        image = states[s, source]
-        velocity = image.xy
-
-        sign = self.walls.reflection(i, j)
-        drive = self.walls.drive(s, i, j)
-        reflected = sign * velocity
-        image.xy = reflected + drive
-
-        ghost = self.at(i, j)
-        states[s, ghost] = image
+    def mirror(self, s: i32, g: i32) -> None:
+        """Fill a ghost node before the forces."""
+        n = self.ghost_node[g]
+        source = self.ghost_source[g]
+        sign = self.ghost_sign[g]
+        drive = self.ghost_drive[s, g]
+        state = self.node_state[s, source]
+        jacobian = self.node_jacobian[s, source]
+        mirrored_state = sign * state
+        ghost_state = mirrored_state + drive
+        self.node_state[s, n] = ghost_state
+        self.node_jacobian[s, n] = jacobian
 
     @ti.func
-    def mirror_gain(self, s: i32, k: i32) -> None:
-        """Fill the k-th ghost node of dt a: as the velocity by walls at rest."""
-        i, j = self.walls.ring(k)
-        source = self.source(i, j)
+    def mirror_forces(self, s: i32, g: i32) -> None:
+        """Fill a ghost node after the forces; walls at rest mirror dt a."""
+        n = self.ghost_node[g]
+        source = self.ghost_source[g]
+        sign = self.ghost_sign[g]
+        drive = self.ghost_drive[s, g]
+        state = self.next_state[s, source]
         gain = self.node_gain[s, source]
-
-        sign = self.walls.reflection(i, j)
-        reflected = sign * gain
-
-        ghost = self.at(i, j)
-        self.node_gain[s, ghost] = reflected
-
-    @ti.func
-    def pressure_gradient(self, s: i32, i: i32, j: i32) -> vec2:
-        """Return 2 dx grad Jbar, weighted 1/8, 3/4, 1/8 across."""
-        left = i - 1
-        right = i + 1
-        below = j - 1
-        above = j + 1
-        east = self.jacobian_at(s, right, j)
-        west = self.jacobian_at(s, left, j)
-        north = self.jacobian_at(s, i, above)
-        south = self.jacobian_at(s, i, below)
-        north_east = self.jacobian_at(s, right, above)
-        south_west = self.jacobian_at(s, left, below)
-        south_east = self.jacobian_at(s, right, below)
-        north_west = self.jacobian_at(s, left, above)
-
-        near_x = east - west
-        near_y = north - south
-        # along the two diagonals, and their sums along x and y
-        rising = north_east - south_west
-        falling = south_east - north_west
-        far_x = rising + falling
-        far_y = rising - falling
-
-        near = vec2(near_x, near_y)
-        far = vec2(far_x, far_y)
-        near_share = 0.75 * near
-        far_share = 0.125 * far
-        return near_share + far_share
+        mirrored_state = sign * state
+        ghost_state = mirrored_state + drive
+        ghost_gain = sign * gain
+        self.next_state[s, n] = ghost_state
+        self.node_gain[s, n] = ghost_gain
 
     @ti.func
-    def laplacian(self, s: i32, i: i32, j: i32) -> vec4:
-        """Return dx^2 times the Laplacian of (v, r, Jbar), by the four neighbours."""
-        left = i - 1
-        right = i + 1
-        below = j - 1
-        above = j + 1
-        east = self.state_at(s, right, j)
-        west = self.state_at(s, left, j)
-        north = self.state_at(s, i, above)
-        south = self.state_at(s, i, below)
-        middle = self.state_at(s, i, j)
-        along_x = east + west
-        along_y = north + south
-        neighbours = along_x + along_y
-        four_middles = 4.0 * middle
-        return neighbours - four_middles
+    def neighbour(self, n: i32, step: Template, side: Template) -> i32:
+        """Return the number of a node's neighbour, or of the opposite one."""
+        number = n
+        for axis in ti.static(self.axes):
+            stride = self.stride[axis]
+            steps = side * step[axis]
+            nodes_between = steps * stride
+            number += nodes_between
+        return number
 
     @ti.func
-    def add_forces(self, s: i32, i: i32, j: i32) -> None:
-        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v."""
-        node = self.at(i, j)
-        state = self.node_state[s, node]
-        gradient = self.pressure_gradient(s, i, j)
-        laplacian = self.laplacian(s, i, j)
+    def pressure_gradient(self, s: i32, n: i32) -> vec4:
+        """Return 2 dx grad Jbar, weighted 1/8, 3/4, 1/8 along every other axis."""
+        # differences of Jbar, by the number of further axes along which pairs differ
+        rises = ti.Matrix.zero(f32, 3, 3)
+        for step in ti.static(self.pairs):
+            ahead = self.neighbour(n, step, 1)
+            behind = self.neighbour(n, step, -1)
+            jacobian_ahead = self.node_jacobian[s, ahead]
+            jacobian_behind = self.node_jacobian[s, behind]
+            rise = jacobian_ahead - jacobian_behind
+            further = ti.static(_axis_count(step) - 1)
+            for axis in ti.static(self.axes):
+                sum_before = rises[further, axis]
+                sum_after = stepped(sum_before, rise, step[axis])
+                rises[further, axis] = sum_after
+
+        gradient = vec4(0.0)
+        nearest_weight = self.pair_weight[0]
+        for axis in ti.static(self.axes):
+            nearest_rise = rises[0, axis]
+            slope = nearest_weight * nearest_rise
+            for further in ti.static(self.further_counts):
+                weight = self.pair_weight[further]
+                further_rise = rises[further, axis]
+                further_slope = weight * further_rise
+                slope = slope + further_slope
+            gradient[axis] = slope
+        return gradient
+
+    @ti.func
+    def laplacian(self, s: i32, n: i32) -> vec4:
+        """Return dx^2 times the Laplacian of (v, r), by the nearest neighbours."""
+        neighbour_sum = vec4(0.0)
+        for step in ti.static(self.nearest_pairs):
+            ahead = self.neighbour(n, step, 1)
+            behind = self.neighbour(n, step, -1)
+            state_ahead = self.node_state[s, ahead]
+            state_behind = self.node_state[s, behind]
+            pair_sum = state_ahead + state_behind
+            neighbour_sum = neighbour_sum + pair_sum
+        middle = self.node_state[s, n]
+        neighbour_count = 2.0 * self.dimension
+        middle_sum = neighbour_count * middle
+        return neighbour_sum - middle_sum
+
+    @ti.func
+    def add_forces(self, s: i32, n: i32) -> None:
+        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v + dt f."""
+        state = self.node_state[s, n]
+        density = state[3]
+        gradient = self.pressure_gradient(s, n)
+        laplacian = self.laplacian(s, n)
         diffusion = self.diffusion_number[s]
-
         pressure_gain = self.pressure_factor * gradient
-        velocity_laplacian = laplacian.xy
-        viscous_gain = diffusion * velocity_laplacian
+        viscous_gain = diffusion * laplacian
         gain = pressure_gain + viscous_gain
-        self.node_gain[s, node] = gain
+        if ti.static(self.has_force):
+            layer = self.force_layer[n]
+            force_gain = self.force_gain[s, layer]
+            gain = gain + force_gain
+        if ti.static(self.has_fringe):
+            stream = self.stream[s]
+            lag = stream - state
+            damping = self.fringe_damping[n]
+            fringe_gain = damping * lag
+            gain = gain + fringe_gain
+        v = state + gain
+        if ti.static(self.has_obstacle):
+            mask = self.fluid_mask[s, n]
+            gain = mask * gain
+            v = mask * v
 
-        old_velocity = state.xy
-        velocity = old_velocity + gain
-        state.xy = velocity
-        self.next_state[s, node] = state
-
-        speed = ti.abs(velocity)
-        peak = self.peak_speed[s, node]
-        peak = largest(speed.y, peak)
-        peak = largest(speed.x, peak)
-        self.peak_speed[s, node] = peak
+        speed = ti.abs(v)
+        peak = self.peak_speed[s, n]
+        for axis in ti.static(self.axes):
+            component = speed[axis]
+            peak = largest(component, peak)
+        self.peak_speed[s, n] = peak
+        # The fourth lanes hold Jbar and r.
+        jacobian = self.node_jacobian[s, n]
+        gain[3] = jacobian
+        v[3] = density
+        self.node_gain[s, n] = gain
+        self.next_state[s, n] = v
 
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
-        """Interpolate (v, r, Jbar), their slopes and dt a."""
-        lowest, offset = base_node(self.weight_rows, s, p)
-        base = masked(lowest, self.node_count)
+        """Interpolate (v, r), its slopes, dt a and Jbar."""
+        if ti.static(self.has_z):
+            self.g2p_solid(s, p)
+        else:
+            self.g2p_flat(s, p)
+
+    @ti.func
+    def g2p_flat(self, s: i32, p: i32) -> None:
+        """Interpolate in two dimensions, node by node."""
+        place = self.stencil_place[s, p]
+        lowest = self.lowest_node(place)
+        weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
         state = vec4(0.0)
-        gain = vec2(0.0)
-        # sums of w q (x_i - x_middle) / dx, along x and along y
+        gain = vec4(0.0)
+        # first moments of the state about the middle node [cells]
         moment_x = vec4(0.0)
         moment_y = vec4(0.0)
-        for i in ti.static(range(3)):
-            weights = self.weight_rows[i][s, p]
-            column = base + i * self.width
-            for j in ti.static(range(3)):
-                node = column + j
-                weight = weights[j]
+        for step in ti.static(self.row_steps):
+            weights = self.row_weights(weight_x, weight_y, weight_z, step)
+            start = self.row_start(lowest, step)
+            for k in ti.static(_ROW):
+                node = start + k
+                weight = weights[k]
                 node_state = self.next_state[s, node]
-                node_gain = self.node_gain[s, node]
                 share = weight * node_state
+                node_gain = self.node_gain[s, node]
                 gain_share = weight * node_gain
                 gain += gain_share
                 state += share
-                moment_x = stepped(moment_x, share, i - 1)
-                moment_y = stepped(moment_y, share, j - 1)
+                moment_x = stepped(moment_x, share, step[0])
+                moment_y = stepped(moment_y, share, k - 1)
+        self.grid_state[s, p] = state
+        self.grid_gain[s, p] = gain
 
-        # the same about the particle
-        offset_x = offset.x * state
-        offset_y = offset.y * state
-        moment_x = moment_x - offset_x
-        moment_y = moment_y - offset_y
+        # from there to the particle
+        shift_x = place.x * state
+        shift_y = place.y * state
+        moment_x = moment_x - shift_x
+        moment_y = moment_y - shift_y
         slope_x = self.slope_factor * moment_x
         slope_y = self.slope_factor * moment_y
-        self.slope_x[s, p] = slope_x
-        self.slope_y[s, p] = slope_y
+        self.slopes[0][s, p] = slope_x
+        self.slopes[1][s, p] = slope_y
+
+    @ti.func
+    def g2p_solid(self, s: i32, p: i32) -> None:
+        """Interpolate in three dimensions, row by row along z, which takes fewer
+        sums.
+        """
+        place = self.stencil_place[s, p]
+        lowest = self.lowest_node(place)
+        weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
+        state = vec4(0.0)
+        gain = vec4(0.0)
+        # first moments of the state about the middle node [cells]
+        moment_x = vec4(0.0)
+        moment_y = vec4(0.0)
+        moment_z = vec4(0.0)
+        for step in ti.static(self.row_steps):
+            weights = self.row_weights(weight_x, weight_y, weight_z, step)
+            low_weight = weights[0]
+            mid_weight = weights[1]
+            high_weight = weights[2]
+            start = self.row_start(lowest, step)
+            middle = start + 1
+            last = start + 2
+
+            low_state = self.next_state[s, start]
+            mid_state = self.next_state[s, middle]
+            high_state = self.next_state[s, last]
+            low_share = low_weight * low_state
+            mid_share = mid_weight * mid_state
+            high_share = high_weight * high_state
+            row_state = low_share + mid_share + high_share
+
+            low_gain = self.node_gain[s, start]
+            mid_gain = self.node_gain[s, middle]
+            high_gain = self.node_gain[s, last]
+            low_gain_share = low_weight * low_gain
+            mid_gain_share = mid_weight * mid_gain
+            high_gain_share = high_weight * high_gain
+            row_gain = low_gain_share + mid_gain_share + high_gain_share
+
+            state += row_state
+            gain += row_gain
+            moment_x = stepped(moment_x, row_state, step[0])
+            moment_y = stepped(moment_y, row_state, step[1])
+            row_moment = high_share - low_share
+            moment_z += row_moment
         self.grid_state[s, p] = state
-        filled_gain = vec4(gain, 0.0, 0.0)
-        self.grid_gain[s, p] = filled_gain
+        self.grid_gain[s, p] = gain
+
+        # from there to the particle
+        shift_x = place.x * state
+        shift_y = place.y * state
+        shift_z = place.z * state
+        moment_x = moment_x - shift_x
+        moment_y = moment_y - shift_y
+        moment_z = moment_z - shift_z
+        slope_x = self.slope_factor * moment_x
+        slope_y = self.slope_factor * moment_y
+        slope_z = self.slope_factor * moment_z
+        self.slopes[0][s, p] = slope_x
+        self.slopes[1][s, p] = slope_y
+        self.slopes[2][s, p] = slope_z
 
     @ti.func
     def update(self, s: i32, p: i32) -> None:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
         grid_state = self.grid_state[s, p]
-        grid_velocity = grid_state.xy
-        grid_density = grid_state[2]
-        grid_jacobian = grid_state[3]
+        grid_velocity = grid_state.xyz
+        grid_density = grid_state[3]
         grid_gain = self.grid_gain[s, p]
-        slope_x = self.slope_x[s, p]
-        slope_y = self.slope_y[s, p]
-
+        velocity_gain = grid_gain.xyz
+        grid_jacobian = grid_gain[3]
         density = largest(grid_density, 0.5)
         volume = 1.0 / density
-        density_slope_x = slope_x[2]
-        density_slope_y = slope_y[2]
-        density_slope = vec2(density_slope_x, density_slope_y)
-        shift_per_slope = self.shift_factor * volume
-        shift = shift_per_slope * density_slope
-        bound = self.shift_bound
-        shift = bounded(shift, -bound, bound)
-
         old_state = self.particle_state[s, p]
-        old_velocity = old_state.xy
-        velocity_gain = grid_gain.xy
-        velocity = old_velocity + velocity_gain
-        velocity_lag = grid_velocity - velocity
-        relaxed = self.parameters.velocity_relaxation * velocity_lag
-        velocity = velocity + relaxed
-        # C s
-        velocity_slope_x = slope_x.xy
-        velocity_slope_y = slope_y.xy
-        change_x = shift.x * velocity_slope_x
-        change_y = shift.y * velocity_slope_y
-        change = change_x + change_y
-        velocity = velocity + change
+        old_velocity = old_state.xyz
+        old_jacobian = old_state[3]
+        v = old_velocity + velocity_gain
+        velocity_lag = grid_velocity - v
+        relaxation = self.parameters.velocity_relaxation * velocity_lag
+        v = v + relaxation
+
+        shift = vec3(0.0)
+        shift_change = vec3(0.0)  # of the velocity, along the shift
+        divergence = 0.0
+        shift_bound = self.shift_bound
+        shift_strength = self.shift_factor * volume
+        for axis in ti.static(self.axes):
+            slope = self.slopes[axis][s, p]
+            velocity_slope = slope.xyz
+            density_slope = slope[3]
+            strain_rate = slope[axis]
+            wanted = shift_strength * density_slope
+            axis_shift = bounded(wanted, -shift_bound, shift_bound)
+            shift[axis] = axis_shift
+            axis_change = axis_shift * velocity_slope
+            if ti.static(axis == 0):
+                shift_change = axis_change
+                divergence = strain_rate
+            else:
+                shift_change = shift_change + axis_change
+                divergence = divergence + strain_rate
+        v = v + shift_change
 
         old_x = self.x[s, p]
-        old_position = old_x.xy
-        way = self.dt * grid_velocity
-        step = way + shift
-        moved = old_position + step
-        inside = bounded(moved, self.position_min, self.position_max)
-        x = vec4(inside, 0.0, 0.0)
-        self.x[s, p] = x
+        inside = vec3(0.0)
+        for axis in ti.static(self.axes):
+            flow_speed = grid_velocity[axis]
+            axis_shift = shift[axis]
+            flow_step = self.dt * flow_speed
+            step = flow_step + axis_shift
+            old_coordinate = old_x[axis]
+            target = old_coordinate + step
+            coordinate = self.kept_inside(target, axis)
+            inside[axis] = coordinate
+        x = inside
+        if ti.static(self.has_obstacle):
+            # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
+            x = self.kept_outside(s, inside)
 
-        u_x = slope_x.x
-        v_y = slope_y.y
-        divergence = u_x + v_y
+        strain = self.dt * divergence
+        growth = strain * old_jacobian
+        flowed = old_jacobian + growth
+        jacobian = self.relaxed(flowed, old_jacobian, grid_jacobian, volume)
+        state = vec4(v, jacobian)
+        self.particle_state[s, p] = state
+        speed = ti.abs(v)
+        reached = vec4(speed, jacobian)
+        extremes = self.extremes[s, p]
+        extremes = largest(reached, extremes)
+        self.extremes[s, p] = extremes
+        old_minus_jacobian = old_x[3]
+        minus_jacobian = largest(-jacobian, old_minus_jacobian)
+        position = vec4(x, minus_jacobian)
+        self.x[s, p] = position
+
+    @ti.func
+    def hold(self, s: i32, p: i32) -> None:
+        """Relax J_p of an obstacle's particle, which neither moves nor deforms."""
+        grid_state = self.grid_state[s, p]
+        grid_density = grid_state[3]
+        density = largest(grid_density, 0.5)
+        volume = 1.0 / density
+        grid_gain = self.grid_gain[s, p]
+        grid_jacobian = grid_gain[3]
+        no_slope = vec4(0.0)
+        for axis in ti.static(self.axes):
+            self.slopes[axis][s, p] = no_slope
+        old_state = self.particle_state[s, p]
         old_jacobian = old_state[3]
-        expansion = self.dt * divergence
-        growth = expansion * old_jacobian
+        jacobian = self.relaxed(old_jacobian, old_jacobian, grid_jacobian, volume)
+        state = vec4(0.0, 0.0, 0.0, jacobian)
+        self.particle_state[s, p] = state
+
+    @ti.func
+    def relaxed(
+        self,
+        flowed: f32,
+        old_jacobian: f32,
+        grid_jacobian: f32,
+        volume: f32,
+    ) -> f32:
+        """Return J_p, after the flow changed it, drawn towards Jbar and 1/r."""
         lag = grid_jacobian - old_jacobian
         relaxation = self.parameters.jacobian_relaxation * lag
         compression = volume - grid_jacobian
         coupling = self.parameters.density_coupling * compression
-        jacobian = old_jacobian + growth
-        jacobian = jacobian + relaxation
-        jacobian = jacobian + coupling
-        state = vec4(velocity, 1.0, jacobian)
-        self.particle_state[s, p] = state
-
-        speed = ti.abs(velocity)
-        reached = vec4(speed, jacobian, -jacobian)
-        extremes = self.extremes[s, p]
-        extremes = largest(reached, extremes)
-        self.extremes[s, p] = extremes
+        return flowed + relaxation + coupling
 
     @ti.func
-    def sum_velocity(self, s: i32, n: i32) -> None:
-        """Add a node's velocity to its sum over time, outside the path of the bits."""
-        state = self.next_state[s, n]
-        velocity = state.xy
-        exact = ti.cast(velocity, f64)
-        velocity_sum = self.velocity_sum[s, n]
-        velocity_sum = velocity_sum + exact
-        self.velocity_sum[s, n] = velocity_sum
+    def kept_outside(self, s: i32, target: vec3) -> Value:
+        """Return a place, or the nearest on the obstacle's surface if inside."""
+        obstacle = self.obstacle[s]
+        centre = obstacle.xyz
+        radius = obstacle[3]
+        way = target - centre
+        square_x = way.x * way.x
+        square_y = way.y * way.y
+        square_z = way.z * way.z
+        square = square_x + square_y + square_z
+        radius_square = radius * radius
+        # A place at the very centre has no nearest one; it stays.
+        is_near = square < radius_square
+        is_off_centre = square > 0.0
+        is_inside = is_near and is_off_centre
+        safe_square = ti.select(is_inside, square, 1.0)
+        distance = ti.sqrt(safe_square)
+        stretch = radius / distance
+        excess = stretch - 1.0
+        way_out = excess * way
+        on_surface = target + way_out
+        return ti.select(is_inside, on_surface, target)
+
+    @ti.func
+    def kept_inside(self, target: f32, axis: Template) -> f32:
+        """Return a coordinate between the walls, or wrapped into [low, high)."""
+        low = self.position_min[axis]
+        high = self.position_max[axis]
+        x = target
+        if ti.static(self.periodic[axis]):
+            period = self.period[axis]
+            is_above = x >= high
+            lowered = x - period
+            x = ti.select(is_above, lowered, x)
+            is_below = x < low
+            raised = x + period
+            x = ti.select(is_below, raised, x)
+            # The sum may round up to the end of the period; NaN becomes its start.
+            is_within = x < high
+            x = ti.select(is_within, x, low)
+        else:
+            x = bounded(x, low, high)
+        return x
 
     # The drivers: the same phases in the same order.
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread."""
-        average = int(self.averaging)
-        self._serial_substeps(substeps, average)
+        tables = self.tables
+        self._serial_substeps(
+            substeps,
+            self.particles,
+            self.parameters.particles,
+            tables.node_count,
+            len(tables.interior),
+            len(tables.images.node),
+            len(tables.ghosts.node),
+        )
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
-        self._parallel_substep()
-        if self.averaging:
-            self._add_to_total()
+        tables = self.tables
+        self._parallel_substep(
+            self.particles,
+            self.parameters.particles,
+            tables.node_count,
+            len(tables.interior),
+            len(tables.images.node),
+            len(tables.ghosts.node),
+        )
 
     @ti.kernel
-    def _serial_substeps(self, substeps: i32, average: i32) -> Nothing:
-        particles = ti.static(self.particles)
-        ring_size = ti.static(self.walls.ring_size)
-        first_node, end_node = ti.static(self.walls.all_nodes)
-        first_inner, end_inner = ti.static(self.walls.interior_nodes)
+    def _serial_substeps(
+        self,
+        substeps: i32,
+        particles: i32,
+        fluid: i32,
+        nodes: i32,
+        interior: i32,
+        edges: i32,
+        ghosts: i32,
+    ) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
-            # Read first, so that the address of the fields stays out of the loops: else
-            # no vectors.
+            # Read before the loops: with the address of the fields inside them LLVM
+            # would not vectorise.
             particle_volume = self.particle_volume[0]
-            for i in range(first_node, end_node):
-                for j in range(first_node, end_node):
-                    self.clear(0, i, j)
+            for n in range(nodes):
+                self.clear(0, n)
             for p in range(particles):
                 self.locate(0, p)
             for p in range(particles):
                 self.p2g(0, p)
-            for i in range(first_inner, end_inner):
-                for j in range(first_inner, end_inner):
-                    self.fold(0, i, j, particle_volume)
-            for k in range(ring_size):
-                self.mirror(self.node_state, 0, k)
-            for i in range(first_inner, end_inner):
-                for j in range(first_inner, end_inner):
-                    self.add_forces(0, i, j)
-            for k in range(ring_size):
-                self.mirror(self.next_state, 0, k)
-                self.mirror_gain(0, k)
-            if average:
-                for n in range(self.node_count):
-                    self.sum_velocity(0, n)
+            for n in range(nodes):
+                self.settle(0, n)
+            for e in range(edges):
+                self.add_images(0, e)
+            for i in range(interior):
+                n = self.interior_node[i]
+                self.fold(0, n, particle_volume)
+            for g in range(ghosts):
+                self.mirror(0, g)
+            for i in range(interior):
+                n = self.interior_node[i]
+                self.add_forces(0, n)
+            for g in range(ghosts):
+                self.mirror_forces(0, g)
             for p in range(particles):
                 self.g2p(0, p)
-            for p in range(particles):
+            for p in range(fluid):
                 self.update(0, p)
+            if ti.static(self.has_obstacle):
+                for p in range(fluid, particles):
+                    self.hold(0, p)
 
     @ti.kernel
-    def _parallel_substep(self) -> Nothing:
+    def _parallel_substep(
+        self,
+        particles: i32,
+        fluid: i32,
+        nodes: i32,
+        interior: i32,
+        edges: i32,
+        ghosts: i32,
+    ) -> Nothing:
         threads = ti.static(self.threads)
         scenarios = ti.static(self.scenarios)
-        particles = ti.static(self.particles)
-        ring_size = ti.static(self.walls.ring_size)
-        all_nodes = ti.static(self.walls.all_nodes)
-        interior = ti.static(self.walls.interior_nodes)
         ti.loop_config(parallelize=threads)
-        for s, i, j in ti.ndrange(scenarios, all_nodes, all_nodes):
-            self.clear(s, i, j)
+        for s, n in ti.ndrange(scenarios, nodes):
+            self.clear(s, n)
         ti.loop_config(parallelize=threads)
         for s, p in ti.ndrange(scenarios, particles):
             self.locate(s, p)
             self.p2g(s, p)
         ti.loop_config(parallelize=threads)
-        for s, i, j in ti.ndrange(scenarios, interior, interior):
+        for s, n in ti.ndrange(scenarios, nodes):
+            self.settle(s, n)
+        ti.loop_config(parallelize=threads)
+        for s, e in ti.ndrange(scenarios, edges):
+            self.add_images(s, e)
+        ti.loop_config(parallelize=threads)
+        for s, i in ti.ndrange(scenarios, interior):
+            n = self.interior_node[i]
             particle_volume = self.particle_volume[s]
-            self.fold(s, i, j, particle_volume)
+            self.fold(s, n, particle_volume)
         ti.loop_config(parallelize=threads)
-        for s, k in ti.ndrange(scenarios, ring_size):
-            self.mirror(self.node_state, s, k)
+        for s, g in ti.ndrange(scenarios, ghosts):
+            self.mirror(s, g)
         ti.loop_config(parallelize=threads)
-        for s, i, j in ti.ndrange(scenarios, interior, interior):
-            self.add_forces(s, i, j)
+        for s, i in ti.ndrange(scenarios, interior):
+            n = self.interior_node[i]
+            self.add_forces(s, n)
         ti.loop_config(parallelize=threads)
-        for s, k in ti.ndrange(scenarios, ring_size):
-            self.mirror(self.next_state, s, k)
-            self.mirror_gain(s, k)
+        for s, g in ti.ndrange(scenarios, ghosts):
+            self.mirror_forces(s, g)
         ti.loop_config(parallelize=threads)
         for s, p in ti.ndrange(scenarios, particles):
             self.g2p(s, p)
-            self.update(s, p)
+            if ti.static(self.has_obstacle):
+                if p < fluid:
+                    self.update(s, p)
+                else:
+                    self.hold(s, p)
+            else:
+                self.update(s, p)
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
-        self._restart_extremes(self.particles, self.node_count)
+        fluid = self.parameters.particles
+        nodes = self.tables.node_count
+        self._restart_extremes(fluid, nodes)
 
     @ti.kernel
     def _restart_extremes(self, particles: i32, nodes: i32) -> Nothing:
-        # Counts are arguments: with some constants, such as 4,000, LLVM compiles for
-        # twenty seconds.
-        scenarios = ti.static(self.scenarios)
         is_serial = ti.static(not self.atomic)
+        scenarios = ti.static(self.scenarios)
         ti.loop_config(serialize=is_serial)
         for s, p in ti.ndrange(scenarios, particles):
-            state = self.particle_state[s, p]
-            velocity = state.xy
+            state = self.particle_state[s, p]  # v_p, J_p
+            velocity = state.xyz
             jacobian = state[3]
             speed = ti.abs(velocity)
-            extremes = vec4(speed, jacobian, -jacobian)
+            extremes = vec4(speed, jacobian)
             self.extremes[s, p] = extremes
+            # this lane keeps the largest -J
+            minus_jacobian = -jacobian
+            self.x[s, p][3] = minus_jacobian
         ti.loop_config(serialize=is_serial)
         for s, n in ti.ndrange(scenarios, nodes):
             self.peak_speed[s, n] = 0.0
 
-    @ti.kernel
-    def _add_to_total(self) -> Nothing:
-        for s, n in self.next_state:
-            self.sum_velocity(s, n)
+
+def _axis_count(step: tuple[int, ...]) -> int:
+    """Return along how many axes a neighbour lies off."""
+    nonzero = [value for value in step if value != 0]
+    return len(nonzero)
+
+
+def _vector_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of vectors of four."""
+    return vec4.field()
+
+
+def _number_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of numbers."""
+    return ti.field(f32)
+
+
+def _index_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of numbers of nodes, ghosts or layers."""
+    return ti.field(i32)
+
+
+def _sum_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of fixed-point sums of vectors of four."""
+    return ti.Vector.field(LANES, i64)

@@ -44,7 +44,6 @@ from .full_box_parameters import FullBoxParameters
 from .solver import Health, Singles
 from .soundness import SoundnessRecorder
 from .split import (
-    ClosedBoxParameters,
     FreeSurfaceParameters,
     InitialState,
     SolverParameters,
@@ -145,7 +144,7 @@ def _has_driving_walls(parameters: SolverParameters) -> bool:
     """Tell whether a full box ends at walls along some axis."""
     if isinstance(parameters, FullBoxParameters):
         return not all(parameters.box.periodic)
-    return isinstance(parameters, ClosedBoxParameters)
+    return False
 
 
 def active_frames(energies: Sequence[float], task: Task) -> int:

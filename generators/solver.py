@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from .full_box_parameters import FullBoxParameters
 from .split import (
-    ClosedBoxParameters,
     Device,
     FreeSurface3DParameters,
     FreeSurfaceParameters,
@@ -78,7 +77,6 @@ class Solver(Protocol):
 
 
 IMPLEMENTATIONS: dict[type, tuple[str, str]] = {
-    ClosedBoxParameters: (".closed_box", "ClosedBox"),
     FreeSurfaceParameters: (".free_surface", "FreeSurface"),
     FreeSurface3DParameters: (".free_surface_3d", "FreeSurface3D"),
     FullBoxParameters: (".full_box", "FullBox"),

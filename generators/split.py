@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
 __all__ = [
-    "ClosedBoxParameters",
     "Device",
     "FreeSurface3DParameters",
     "FreeSurfaceParameters",
@@ -52,32 +51,6 @@ class Material(enum.IntEnum):
     JELLY = 1
     SNOW = 2
     ROPE = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClosedBoxParameters:
-    """Constants of the weakly compressible solver with stress at the nodes.
-
-    The equations stand in :mod:`.nodal_stress`. The walls lie half-way between nodes,
-    at ``(wall + 1/2) / grid`` and its mirror image.
-    """
-
-    particles: int  # particles in one scenario
-    grid: int  # cells across the unit box; the grid has grid + 1 nodes a side
-    dt: float  # substep [s]
-    wall: int  # index of the ghost node layer outside the low walls
-    # whether the walls hold the fluid (cavity) or let it slide (curl noise)
-    no_slip: bool
-    density: float  # rest density rho [mass/length^2]
-    modulus: float  # bulk modulus E [mass/s^2]; the speed of sound is sqrt(E/rho)
-    # lambda, share of the grid velocity mixed into v_p per substep [1]
-    velocity_relaxation: float
-    # kappa, share of the nodal J mixed into J_p per substep [1]
-    jacobian_relaxation: float
-    # theta, pull of J_p towards the grid density per substep [1]
-    density_coupling: float
-    shift: float  # beta, strength of the particle shift [1]
-    substeps_per_frame: int = 1  # substeps for which one row of a wall program acts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,9 +102,7 @@ class FreeSurface3DParameters(FreeSurfaceParameters):
     """
 
 
-SolverParameters: TypeAlias = (
-    ClosedBoxParameters | FreeSurfaceParameters | FullBoxParameters
-)
+SolverParameters: TypeAlias = FreeSurfaceParameters | FullBoxParameters
 """Constants of a solver; their type chooses the formulation."""
 
 

@@ -9,16 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.generators.closed_box import ClosedBox
+from lagbench.data.box import Box
 from lagbench.generators.draws import fill, quantise
+from lagbench.generators.full_box import FullBox
+from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.solver import build
-from lagbench.generators.split import ClosedBoxParameters, Device, InitialState
+from lagbench.generators.split import Device, InitialState
 from lagbench.work.machine import available_cores
 
 ALL_LIDS = (0.3, -0.2, 0.25, -0.35)
 
 
-def parameters(**changes: float | bool) -> ClosedBoxParameters:
+def parameters(*, wall: int = 2, **changes: float | bool) -> FullBoxParameters:
     """Return the cavity's constants on a box of 11 x 11 cells of nine particles, or
     changes of them.
     """
@@ -26,7 +28,6 @@ def parameters(**changes: float | bool) -> ClosedBoxParameters:
         "particles": 1089,
         "grid": 16,
         "dt": 4e-3,
-        "wall": 2,
         "no_slip": True,
     }
     values |= {
@@ -36,7 +37,10 @@ def parameters(**changes: float | bool) -> ClosedBoxParameters:
         "jacobian_relaxation": 0.1,
     }
     values |= {"density_coupling": 0.01, "shift": 0.01, "substeps_per_frame": 7}
-    return ClosedBoxParameters(**(values | changes))
+    values |= changes
+    low = (wall + 0.5) / values["grid"]
+    walls = Box.from_bounds([(low, 1.0 - low)] * 2)
+    return FullBoxParameters(box=walls, **values)
 
 
 # Constants are compiled into the kernels, which takes seconds: tests share these few
@@ -54,14 +58,14 @@ INERT = parameters(
 )
 
 
-def box(constants: ClosedBoxParameters) -> tuple[float, float]:
+def box(constants: FullBoxParameters) -> tuple[float, float]:
     """Return the coordinates of the low and the high walls."""
-    low = (constants.wall + 0.5) / constants.grid
-    return low, 1.0 - low
+    low, high = constants.box.bounds[0]
+    return low, high
 
 
 def scenario(
-    constants: ClosedBoxParameters,
+    constants: FullBoxParameters,
     *,
     seed: int = 0,
     speed: float = 0.0,
@@ -111,26 +115,26 @@ def compiled(
 
 
 def loaded(
-    constants: ClosedBoxParameters,
+    constants: FullBoxParameters,
     states: Sequence[InitialState],
     **options: Device | int,
-) -> ClosedBox:
+) -> FullBox:
     """Return a solver with fresh scenarios; the next call with its arguments takes it
     over.
     """
-    solver: ClosedBox = compiled(constants, scenarios=len(states), **options)
+    solver: FullBox = compiled(constants, scenarios=len(states), **options)
     solver.load(states)
     return solver
 
 
-def snapshot(solver: ClosedBox) -> dict[str, NDArray[Any]]:
+def snapshot(solver: FullBox) -> dict[str, NDArray[Any]]:
     """Return every array that a caller can read, as it is now."""
     names = ("position", "velocity", "jacobian", "grid_velocity")
     return {name: getattr(solver, name)() for name in names}
 
 
 def after(
-    constants: ClosedBoxParameters,
+    constants: FullBoxParameters,
     states: Sequence[InitialState],
     *substeps: int,
     **options: Device | int,

@@ -1,6 +1,6 @@
 """The solver of full boxes a second time, in NumPy, in two and three dimensions.
 
-Written from the equations of ``generators/nodal_stress_nd.py``, whole arrays at once.
+Written from the equations of ``generators/nodal_stress.py``, whole arrays at once.
 Every operation rounds to float32 in the order in which the equation is written; sums
 over particles are 64-bit integers. Ghosts are filled and folded as slices, without
 tables.

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from lagbench.generators.split import ClosedBoxParameters
+from lagbench.generators.full_box_parameters import FullBoxParameters
 
 # extent of the regions under the two ends of the lid, where J is far from 1 [cells]
 CORNER_CELLS = 5
@@ -56,11 +56,10 @@ class SquareBox:
         return np.asarray(self.low + self.spacing * middles, dtype=np.float64)
 
 
-def box_of(parameters: ClosedBoxParameters) -> SquareBox:
+def box_of(parameters: FullBoxParameters) -> SquareBox:
     """Return the box that the parameters describe."""
-    low = (parameters.wall + 0.5) / parameters.grid
-    cells = parameters.grid - 2 * parameters.wall - 1
-    return SquareBox(low=low, high=1.0 - low, cells=cells)
+    low, high = parameters.box.bounds[0]
+    return SquareBox(low=low, high=high, cells=parameters.cells[0])
 
 
 def occupancy(position: Reals, box: SquareBox) -> NDArray[np.int64]:

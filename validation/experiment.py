@@ -20,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import WALLS, registry
+from lagbench.data.box import Box
 from lagbench.errors import UsageError
 from lagbench.generators import cavity, curl_noise
 from lagbench.generators.draws import fill, quantise
+from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.noise import gradients
 from lagbench.generators.solver import build
 from lagbench.generators.split import (
-    ClosedBoxParameters,
     Device,
     InitialState,
     Material,
@@ -35,7 +36,7 @@ from lagbench.generators.split import (
 from . import diagnostics
 
 if TYPE_CHECKING:
-    from lagbench.generators.closed_box import ClosedBox
+    from lagbench.generators.full_box import FullBox
 
 
 _LEAST_GRID = 16
@@ -289,7 +290,7 @@ def _check_reynolds(
     )
 
 
-def solver_parameters(experiment: Experiment) -> ClosedBoxParameters:
+def solver_parameters(experiment: Experiment) -> FullBoxParameters:
     """Return the constants of size ``full``, with the experiment's particles, grid, dt.
 
     The walls stay where they are, as nearly as the nodes of the grid allow.
@@ -300,14 +301,16 @@ def solver_parameters(experiment: Experiment) -> ClosedBoxParameters:
     else:
         parameters = curl_noise.solver_parameters(full)
     # a wall lies half a cell from its layer of ghost nodes
-    ghost_layer = (parameters.wall + 0.5) * experiment.grid / parameters.grid - 0.5
+    full_low, _ = parameters.box.bounds[0]
+    # Python rounds halves to even, NumPy alike: 4.5 gives 4.
+    ghost_layer = round(full_low * experiment.grid - 0.5)
+    low = (ghost_layer + 0.5) / experiment.grid
     return dataclasses.replace(
         parameters,
         particles=experiment.particles,
         grid=experiment.grid,
         dt=experiment.dt,
-        # Python rounds halves to even, NumPy alike: 4.5 gives 4.
-        wall=round(ghost_layer),
+        box=Box.from_bounds([(low, 1.0 - low)] * 2),
     )
 
 
@@ -461,10 +464,14 @@ def run(
     solver = _build_solver(parameters, state, device)
 
     done = 0
+    velocity_sums = []
     last_position = solver.position()[0]
     for stop in _stops(experiment, result.averaged_from):
         start = time.perf_counter()
-        solver.advance(stop - done, average=done >= result.averaged_from)
+        if done >= result.averaged_from:
+            velocity_sums.append(_sum_of_velocities(solver, stop - done))
+        else:
+            solver.advance(stop - done)
         result.seconds += time.perf_counter() - start
         done = stop
         if done == experiment.lid_off_after:
@@ -485,18 +492,17 @@ def run(
         report(done)
 
     if experiment.case is Case.CAVITY:
-        inside = _interior(parameters)
-        mean_velocity = solver.mean_grid_velocity()[0][inside, inside]
+        mean_velocity = np.sum(velocity_sums, axis=0) / averaged_count
         result.profiles = diagnostics.extract(mean_velocity, box, experiment.lid_speed)
     return result
 
 
 def _build_solver(
-    parameters: ClosedBoxParameters, state: InitialState, device: Device
-) -> ClosedBox:
+    parameters: FullBoxParameters, state: InitialState, device: Device
+) -> FullBox:
     """Return a solver that stands at a state, with compiled kernels."""
     threads = 1 if device is Device.CPU else None
-    solver = cast("ClosedBox", build(parameters, device=device, threads=threads))
+    solver = cast("FullBox", build(parameters, device=device, threads=threads))
     # The first substep compiles; loading again starts afresh, and no compilation is
     # timed.
     solver.load([state])
@@ -515,13 +521,17 @@ def _stops(experiment: Experiment, averaged_from: int) -> list[int]:
     return sorted(stops)
 
 
-def _interior(parameters: ClosedBoxParameters) -> slice:
-    """Return the nodes between two walls."""
-    return slice(parameters.wall + 1, parameters.grid - parameters.wall)
+def _sum_of_velocities(solver: FullBox, substeps: int) -> NDArray[np.float64]:
+    """Advance, and return the sum of the nodal velocities of all substeps."""
+    total = np.zeros((*solver.parameters.cells, 2))
+    for _ in range(substeps):
+        solver.advance(1)
+        total += solver.grid_velocity()[0]
+    return total
 
 
 def _measure_state(
-    solver: ClosedBox, experiment: Experiment, box: diagnostics.SquareBox, substep: int
+    solver: FullBox, experiment: Experiment, box: diagnostics.SquareBox, substep: int
 ) -> AcceptanceCheck:
     """Measure J, the particles per cell and the velocity gradients of the box."""
     position = solver.position()[0]
@@ -531,8 +541,7 @@ def _measure_state(
         outside_corners = jacobian[~diagnostics.lid_corners(position, box)]
 
     counts = diagnostics.occupancy(position, box)
-    inside = _interior(solver.parameters)
-    velocity = solver.grid_velocity()[0][inside, inside]
+    velocity = solver.grid_velocity()[0]
     gradients_of_flow = diagnostics.grid_rates(velocity, box.spacing)
     return AcceptanceCheck(
         substep=substep,

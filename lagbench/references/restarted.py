@@ -37,11 +37,9 @@ from lagbench.data.registry import Size
 from lagbench.errors import check_installed
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.draws import quantise
-from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.obstacle import Obstacle
 from lagbench.generators.solver import Solver, build
 from lagbench.generators.split import (
-    ClosedBoxParameters,
     FreeSurfaceParameters,
     InitialState,
     SolverParameters,
@@ -128,8 +126,6 @@ def resolve(size: Size, refinement: float) -> Resolution:
         values["wall"] = wall
         values["gravity"] = constants.gravity * scale
     else:
-        if isinstance(constants, ClosedBoxParameters):
-            constants = _as_full_box(constants, size.box)
         grid = math.ceil(actual * size.grid - 1e-9)
         scale = float(cells[0] / (grid * lengths[0]))
         solver_low = scale * low
@@ -152,15 +148,6 @@ def resolve(size: Size, refinement: float) -> Resolution:
         low=low,
         solver_low=solver_low,
     )
-
-
-def _as_full_box(constants: ClosedBoxParameters, box: Box) -> FullBoxParameters:
-    """Return the same constants for the solver of any full box."""
-    values = {}
-    for field in fields(constants):
-        if field.name != "wall":
-            values[field.name] = getattr(constants, field.name)
-    return FullBoxParameters(**values, box=box)
 
 
 # --- a scenario on its way ------------------------------------------------------------

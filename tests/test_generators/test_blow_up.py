@@ -19,8 +19,8 @@ from lagbench.errors import WorkFailedError
 from lagbench.generators import batch
 from lagbench.generators import simulate as simulation
 from lagbench.generators.batch import ScenarioBatch, SimulationJob
-from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.constants import split_module
+from lagbench.generators.full_box import FullBox
 from lagbench.generators.simulate import simulate
 from lagbench.generators.split import Device, InitialState
 from lagbench.make.generate import generate
@@ -137,13 +137,13 @@ def test_a_good_run_loads_its_states_once(
     """Nothing is replayed where nothing fails."""
     size = unmeasured.size(SPLIT, SIZE)
     loads: list[int] = []
-    load_states = ClosedBox.load
+    load_states = FullBox.load
 
-    def counted(solver: ClosedBox, states: Sequence[InitialState]) -> None:
+    def counted(solver: FullBox, states: Sequence[InitialState]) -> None:
         loads.append(len(states))
         load_states(solver, states)
 
-    monkeypatch.setattr(ClosedBox, "load", counted)
+    monkeypatch.setattr(FullBox, "load", counted)
     simulate(
         SimulationJob(size=size, scenarios=(2,), root=tmp_path), lambda units: None
     )

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.draws import quantise
+from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.obstacle import Obstacle
-from lagbench.generators.split import ClosedBoxParameters, Device, InitialState
+from lagbench.generators.split import Device, InitialState
 
 # Each module of kernels takes seconds to compile.
 pytestmark = pytest.mark.slow
@@ -44,7 +45,7 @@ def with_velocity(
 
 
 def cells_of_vortex(
-    constants: ClosedBoxParameters,
+    constants: FullBoxParameters,
     state: InitialState,
 ) -> tuple[Any, Any]:
     """Return velocity and gradient of u = sin kx cos ky, v = -cos kx sin ky, k =
@@ -212,7 +213,7 @@ FLIPPED_WALLS = [1, 0, 2, 3]
     ids=["turned", "flipped"],
 )
 def test_no_direction_is_special(
-    constants: ClosedBoxParameters,
+    constants: FullBoxParameters,
     turn: list[list[float]],
     walls_from: list[int],
 ) -> None:

@@ -28,7 +28,7 @@ from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.generators.closed_box import ClosedBox
+from lagbench.generators.full_box import FullBox
 from lagbench.generators.solver import build
 from lagbench.generators.split import Device
 from lagbench.make.generate import GenerationResult
@@ -132,7 +132,7 @@ def test_a_closed_solver_leaves_the_others_alone() -> None:
     solver = loaded(NO_SLIP, [state])
     other = build(parameters(grid=20))
     solver.advance(30)
-    cast("ClosedBox", other).close()
+    cast("FullBox", other).close()
     solver.advance(30)
     np.testing.assert_equal(snapshot(solver), expected)
 
@@ -142,7 +142,8 @@ def test_taichi_is_imported_late_and_quietly() -> None:
     script = (
         "import sys, lagbench.generators.solver as solver\n"
         "assert 'taichi' not in sys.modules\n"
-        "from lagbench.generators.split import ClosedBoxParameters\n"
+        "from lagbench.data.box import Box\n"
+        "from lagbench.generators.full_box_parameters import FullBoxParameters\n"
         f"solver.build({NO_SLIP!r})\n"
         "assert 'taichi' in sys.modules\n"
     )

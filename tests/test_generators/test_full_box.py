@@ -7,39 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from box_scenarios import ALL_LIDS, NO_SLIP, after, box, scenario
 from full_box_scenarios import MIXED_BOX, MIXED_COUNTS, constants, mixed_state
 
-from lagbench.data.box import WALL_NAMES, Box
+from lagbench.data.box import WALL_NAMES
 from lagbench.errors import UsageError
 from lagbench.generators.full_box import FullBox
-from lagbench.generators.full_box_parameters import FullBoxParameters
-
-
-@pytest.mark.slow
-def test_a_square_with_four_walls_has_the_bits_of_the_fast_solver() -> None:
-    """Both formulations agree in every bit while four walls move."""
-    low, high = box(NO_SLIP)
-    values = dataclasses.asdict(NO_SLIP)
-    del values["wall"]
-    side = (low, high)
-    square = Box.from_bounds([side, side])
-    state = scenario(
-        NO_SLIP,
-        seed=1,
-        speed=0.5,
-        walls=ALL_LIDS,
-        frames=10,
-    )
-    square_constants = FullBoxParameters(box=square, **values)
-    solver = FullBox(square_constants)
-    solver.load([state])
-    solver.advance(60)
-    expected = after(NO_SLIP, [state], 60)
-    np.testing.assert_array_equal(solver.position(), expected["position"])
-    np.testing.assert_array_equal(solver.velocity(), expected["velocity"])
-    np.testing.assert_array_equal(solver.jacobian(), expected["jacobian"])
-    solver.close()
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from scenario_draws import EVERY, SIZES, SPLITS, all_of, digest, draw, state_of
 
 from lagbench.data import registry
 from lagbench.generators import draws
-from lagbench.generators.split import ClosedBoxParameters
+from lagbench.generators.full_box_parameters import FullBoxParameters
 
 GENERATORS = Path(draws.__file__).parent
 KINDS = [
@@ -137,7 +137,7 @@ def test_solver_constants_come_from_the_registry(split: str, size: str) -> None:
             assert value == entry.value(field.name)
     dt = entry.frame_interval / entry.substeps_per_frame
     assert constants.dt == pytest.approx(dt)
-    if isinstance(constants, ClosedBoxParameters):
+    if isinstance(constants, FullBoxParameters):
         assert constants.no_slip == (split == "cavity")
 
 
