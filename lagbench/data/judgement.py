@@ -279,7 +279,9 @@ class _Motion:
             is_jump = np.abs(column) > 0.5 * extent[axis]
             is_calm = np.median(np.abs(column)) < 0.1 * extent[axis]
             if is_calm and np.count_nonzero(is_jump) >= FEWEST_TOGETHER:
-                self.jumps.setdefault(axis, []).append((frame, column[is_jump]))
+                # without the motion that the others have, too
+                jump = (raw_step[:, axis] - np.median(column))[is_jump]
+                self.jumps.setdefault(axis, []).append((frame, jump))
             if not box.periodic[axis] or self.step_before is None:
                 continue
             raw = raw_step[:, axis]
@@ -499,7 +501,8 @@ def find_shared_frames(
     for subset, members in judgements_of.items():
         judgements += members
         subsets += [subset] * len(members)
-    extent = max(judgement.extent for judgement in judgements) or 1.0
+    # that of the smallest: others may be in another unit
+    extent = min(judgement.extent for judgement in judgements) or 1.0
     frames_of = [_moving_frames(judgement, extent) for judgement in judgements]
     shared: dict[tuple[int, int], int] = {}  # frames by trajectory and earlier one
     for subset in list(judgements_of)[1:]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -44,6 +45,9 @@ RADIUS = 2.0
 SPACING_RATIO = 1.5
 """Ratio of the stated spacing and the measured one, or its inverse, at most."""
 
+MOST_SPREAD = 10.0
+"""Ratio of the spacings of two trajectories, at most."""
+
 FEWEST_NEIGHBOURS = 3.0
 MOST_NEIGHBOURS = 100.0
 """Neighbours within the radius between which nothing is said."""
@@ -61,7 +65,7 @@ class _Judged:
     open: Callable[[], Trajectory]
     judgement: Judgement
     spacing: float | None  # measured in the first frame [length]; None for one particle
-    interval: float | None  # time between two frames that the file states [s]
+    interval: float  # time between two frames, as the user or the file says [s]
     particles: int
     axes: tuple[int, ...]  # components that are not constant
     stated: Mapping[str, Any]  # options that the file states
@@ -141,10 +145,8 @@ def adopt(
     judgements = {}
     for subset, members in judged.items():
         judgements[subset] = [member.judgement for member in members]
-    notes = _shorten(notes)
-    notes += find_shared_frames(judgements)
     description, box, more_notes = _complete(description, judged)
-    notes += more_notes
+    notes = [*_shorten(notes), *more_notes, *find_shared_frames(judgements)]
 
     trajectories = {}
     for subset, members in judged.items():
@@ -310,7 +312,7 @@ def _judge(
         open=open_trajectory,
         judgement=judgement,
         spacing=estimate_spacing(first_frame, box, where=f"{name}, frame 0"),
-        interval=trajectory.interval,
+        interval=interval,
         particles=len(trajectory.material),
         axes=trajectory.axes,
         stated={"bounds": stated.bounds, "periodic": stated.periodic},
@@ -396,19 +398,16 @@ def _complete(
     members = [member for many in judged.values() for member in many]
     first = members[0]
     for member in members:
-        for quantity in ("axes", "interval", "stated"):
-            value = getattr(member, quantity)
-            if value != getattr(first, quantity) and quantity != "interval":
-                raise UsageError(
-                    f"{first.judgement.name} and {member.judgement.name} differ in "
-                    f"{'the box' if quantity == 'stated' else 'their dimensions'}: "
-                    f"{getattr(first, quantity)} and {value}; import them apart"
-                )
-        known = (first.interval, member.interval)
-        if None not in known and abs(known[0] / known[1] - 1.0) > 0.01:
+        differing = None
+        if member.axes != first.axes:
+            differing = f"the dimensions {first.axes} and {member.axes}"
+        elif member.stated != first.stated:
+            differing = f"the boxes {first.stated} and {member.stated}"
+        elif not math.isclose(member.interval, first.interval, rel_tol=0.01):
+            differing = f"frames {first.interval:.6g} and {member.interval:.6g} s apart"
+        if differing is not None:
             raise UsageError(
-                f"{first.judgement.name} and {member.judgement.name} have frames "
-                f"{known[0]:.6g} and {known[1]:.6g} s apart; a split has one interval: "
+                f"{first.judgement.name} and {member.judgement.name} have {differing}; "
                 "import them apart"
             )
     notes = []
@@ -462,7 +461,7 @@ def _complete(
     complete = description.model_copy(
         update={
             "radius": radius,
-            "frame_interval": description.frame_interval or first.interval,
+            "frame_interval": first.interval,
             "bounds": bounds,
             "periodic": periodic,
         }
@@ -477,6 +476,11 @@ def _check_spacing(
     low = min(measured)
     high = max(measured)
     stated = description.spacing
+    if high > MOST_SPREAD * low:
+        raise UsageError(
+            f"spacings of trajectories range from {low:.3g} to {high:.3g}: are they in "
+            "one unit? give all in the same, or import them apart"
+        )
     if stated is None:
         if high > 1.1 * low:
             notes.append(
