@@ -38,6 +38,7 @@ from lagbench.errors import check_installed
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.draws import quantise
 from lagbench.generators.obstacle import Obstacle
+from lagbench.generators.refinement import PER_SUBSTEP
 from lagbench.generators.solver import Solver, build
 from lagbench.generators.split import (
     FreeSurfaceParameters,
@@ -130,6 +131,8 @@ def resolve(size: Size, refinement: float) -> Resolution:
         scale = float(cells[0] / (grid * lengths[0]))
         solver_low = scale * low
         values["substeps_per_frame"] = substeps
+        for name in PER_SUBSTEP:
+            values[name] = min(1.0, getattr(constants, name) / actual)
         values["fringe_length"] = constants.fringe_length * scale
         values["box"] = Box(
             low=tuple(solver_low.tolist()),
