@@ -11,6 +11,7 @@ from . import (
     analog,
     analog_barycentre,
     ballistic_analog,
+    calibrated,
     climatology,
     extrapolation,
     frozen_field,
@@ -29,6 +30,7 @@ _PREDICTORS = (
     ballistic_analog.PREDICTOR,
     *projection.PREDICTORS,
     *restarted.PREDICTORS,
+    *calibrated.PREDICTORS,
     analog_barycentre.PREDICTOR,
 )
 
