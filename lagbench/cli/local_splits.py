@@ -31,7 +31,7 @@ def import_command(
     spacing: float | None = None,
     bounds: str | None = None,
     periodic: str | None = None,
-    rescale: bool = True,
+    rescale: Annotated[bool, Parameter(negative="--no-rescale")] = True,
     input_frames: int | None = None,
     horizon: int | None = None,
     full_box: Annotated[bool | None, Parameter(negative="--free-surface")] = None,
