@@ -341,11 +341,9 @@ def _is_measure(value: object) -> bool:
 def _damaged(path: Path, reason: object) -> UnreadableFileError:
     """Return the error for a file that is no gates.json."""
     return UnreadableFileError(
-        "the gates cannot be read",
+        f"the gates cannot be read: {reason}; restore the file, or remove it and "
+        "measure anew: python -m studies.gates",
         where=str(path),
-        expected="the JSON that `python -m studies.gates` writes",
-        got=reason,
-        fix="restore the file, or remove it and measure anew: python -m studies.gates",
     )
 
 

@@ -177,16 +177,12 @@ def _check_profiles(path: Path | None, case: Case) -> None:
         return
     if case is not Case.CAVITY:
         raise UsageError(
-            "curl noise has no centre-line profiles",
-            where="--profiles",
-            fix="leave it out",
+            "curl noise has no centre-line profiles; leave it out", where="--profiles"
         )
     if path.suffix.lower() not in {".png", ".pdf", ".svg"}:
         raise UsageError(
-            "not a picture format",
+            f"not a picture format: {path}, expected .png, .pdf or .svg",
             where="--profiles",
-            expected=".png, .pdf or .svg",
-            got=path,
         )
 
 

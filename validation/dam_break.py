@@ -122,10 +122,9 @@ def run(size: str, split: str = "fluid") -> DamBreak:
     constants = solver_constants(tier)
     if not isinstance(constants, FreeSurfaceParameters):
         raise UsageError(
-            "a dam breaks on a free surface only",
+            f"a dam breaks on a free surface only: got {split}, expected "
+            f"{', '.join(sorted(WIDTH))}",
             where="--split",
-            expected=", ".join(sorted(WIDTH)),
-            got=split,
         )
     state = column(constants, tier.box.bounds, width)
     constants = replace(constants, particles=len(state.position))

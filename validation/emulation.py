@@ -63,11 +63,9 @@ def find_emulator() -> str:
     path = shutil.which(EMULATOR)
     if path is None:
         raise UsageError(
-            "the emulator is not installed",
+            f"there is no program {EMULATOR}; install the user mode of QEMU: apt-get "
+            "install qemu-user",
             where="PATH",
-            expected=f"the program {EMULATOR}",
-            got="no such program",
-            fix="install the user mode of QEMU: apt-get install qemu-user",
         )
     return path
 

@@ -163,7 +163,7 @@ def _require(
 ) -> None:
     """Raise a UsageError unless something holds."""
     if not holds:
-        raise UsageError(what, where=where, expected=expected, got=got)
+        raise UsageError(f"{what}: got {got}, expected {expected}", where=where)
 
 
 def _round_bound(bound: float, *, is_least: bool) -> str:

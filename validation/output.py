@@ -17,10 +17,9 @@ def check_writable(flag: str, path: Path | None) -> None:
         path.open("ab").close()
     except OSError as error:
         raise UsageError(
-            "the file cannot be written",
+            f"the file cannot be written: {error.strerror}, expected a file in a "
+            "folder that you may write to",
             where=f"{flag} {path}",
-            expected="a file in a folder that you may write to",
-            got=error.strerror,
         ) from error
     if is_new:
         path.unlink()

@@ -174,12 +174,9 @@ def _require(size: Size, folder: Path) -> dict[str, Any]:
     content = _read(size, folder)
     if content is None:
         raise DataError(
-            "no reference predictors were measured on this data set",
+            "no reference predictors were measured on this data set; measure them "
+            "first: python -m lagbench.scoring.measure_references",
             where=str(shipped_path(size, folder)),
-            expected="scores of reference predictors on the present data",
-            got="none, or scores on other data",
-            fix="measure the scores first: "
-            "python -m lagbench.scoring.measure_references",
         )
     return content
 

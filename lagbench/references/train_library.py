@@ -105,11 +105,9 @@ def long_enough(size: Size) -> tuple[int, ...]:
             scenarios.append(scenario)
     if not scenarios:
         raise DataError(
-            "no scenario of train is as long as the task",
+            f"no scenario of train has the {needed} frames of the task; shorten the "
+            "task (--horizon), or take longer trajectories for train",
             where=f"{size.split} {size.name}",
-            expected=f"{needed} frames",
-            got="shorter ones only",
-            fix="shorten the task (--horizon), or take longer trajectories for train",
         )
     return tuple(scenarios)
 
