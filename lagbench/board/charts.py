@@ -124,7 +124,7 @@ def cost_chart(tab: Tab, *, is_large: bool) -> Spec:
     if is_large:
         layers.append(
             {
-                "mark": {"type": "text", "align": "left", "dx": 8},
+                "mark": {"type": "text", "align": "left", "dx": 6, "dy": -7},
                 "encoding": {"x": x, "y": y, "text": {"field": "label"}},
             }
         )

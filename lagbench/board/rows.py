@@ -146,7 +146,7 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tab:
-    """One split and size with at least one active entry."""
+    """One split and size: its active entries and its reference predictors."""
 
     size: Size
     title: str  # of the split
@@ -248,7 +248,7 @@ def conclude(board: Board) -> list[str]:
 
 def _state_result(judged: list[Tab], board: Board) -> Iterator[str]:
     if not judged:
-        yield " ".join(FINDING)
+        yield from FINDING
         return
     pays = [tab for tab in board.pays() if tab in judged]
     total = len(judged)
@@ -276,7 +276,8 @@ def collect(
 ) -> Board:
     """Return the content of a leaderboard's folder.
 
-    Entries of other versions of the data are left out.
+    Entries of other versions of the data are left out. Data sets without entries have
+    their reference predictors, at the sizes of which the board has any entry.
 
     Args:
         board: the leaderboard's folder.
@@ -315,6 +316,7 @@ def collect(
         shift=read_shift(folder),
         metrics=metrics,
     )
+    sizes_with_entries = {size for _, size in entries}
     tabs = []
     for split, description in known.splits.items():
         for name in description.sizes:
@@ -323,7 +325,8 @@ def collect(
             for entry in entries.get((split, name), ()):
                 if entry.status is Status.ACTIVE and is_current(entry.dataset, size):
                     active.append(entry)
-            if active:
+            is_wanted = only is None and name in sizes_with_entries and name != TRIAL
+            if active or (is_wanted and shipped(size)):
                 tabs.append(_make_tab(records, size, description.title, active))
     return Board(tabs=tuple(tabs))
 

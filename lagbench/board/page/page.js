@@ -10,18 +10,23 @@ function draw(section) {
   }
 }
 
-// shows the section that the address names, or the one around what it names
+// shows the data set that the address names, as in #cavity-mini or #cavity-mini.gns
 function show() {
-  const target = document.getElementById(decodeURIComponent(location.hash.slice(1)));
-  const chosen = target?.closest("main > section") ?? sections[0];
+  const address = decodeURIComponent(location.hash.slice(1));
+  const name = address.split(".")[0];
+  const chosen = document.getElementById(`tab-${name}`) ?? sections[0];
   for (const section of sections) section.hidden = section !== chosen;
   for (const link of document.querySelectorAll("nav a")) {
-    link.toggleAttribute("aria-current", link.hash === `#${chosen.id}`);
+    link.toggleAttribute("aria-current", `tab-${link.hash.slice(1)}` === chosen.id);
   }
   draw(chosen);
-  if (target?.matches("details")) target.open = true;
-  if (target && target !== chosen) target.scrollIntoView();
-  else scrollTo(0, 0);
+  const entry = document.getElementById(address);
+  if (entry) {
+    entry.open = true;
+    entry.scrollIntoView();
+  } else {
+    scrollTo(0, 0);
+  }
 }
 
 function sortBy(table, head) {
