@@ -420,73 +420,41 @@ class GraphNetwork(Baseline):
         """
         options = self.options
         check_moving_walls(options.wall_velocity, self.info)
-        self._check_radius()
-        if options.noise_spread and options.noise_std == 0.0:
-            raise UsageError(
-                f"there is no noise to spread: model.noise_std={options.noise_std}; "
-                "--set model.noise_std=1e-3, or leave model.noise_spread out",
-                where="model.noise_spread",
-            )
-        if options.compression > 0.0 and options.recovery is None:
-            raise UsageError(
-                "displaced particles have no way back to the true path: "
-                "model.recovery=null; --set model.recovery=8, or leave "
-                "model.compression out",
-                where="model.compression",
-            )
-        if options.free_flight is not None and (options.body_force or options.obstacle):
-            raise UsageError(
-                "a body in free flight meets no force but gravity: "
-                f"{options.free_flight}; leave the option out",
-                where="model.free_flight",
-            )
-        self._check_relaxation()
-        if options.link_weight is not None and "link" not in self.operator.weights:
-            raise UsageError(
-                f"{self.method} predicts no links: {options.link_weight}; leave the "
-                "option out, or train supergat",
-                where="model.link_weight",
-            )
-
-    def _check_radius(self) -> None:
-        """Refuse a radius within which a particle has two images.
-
-        Raises:
-            UsageError: the radius is above half a period of the box.
-        """
-        radius = self.options.radius
         box = self.info.box
-        if radius is None or box.allows_radius(radius):
-            return
-        raise UsageError(
-            f"the radius is above half of the shortest period: got {radius}, expected "
-            f"at most {box.largest_radius:g}; set a smaller one; the data set has "
-            f"{self.info.radius:g}",
-            where="model.radius",
+        is_forced = options.body_force or options.obstacle
+        contradictions = (
+            (
+                options.radius is not None and not box.allows_radius(options.radius),
+                f"radius is above half of the shortest period, {box.largest_radius:g}",
+            ),
+            (
+                options.noise_spread and options.noise_std == 0.0,
+                "noise_spread needs model.noise_std above 0",
+            ),
+            (
+                options.compression > 0.0 and options.recovery is None,
+                "compression needs model.recovery, as 8",
+            ),
+            (
+                options.free_flight is not None and is_forced,
+                "free_flight knows no force but gravity, and no obstacle",
+            ),
+            (
+                options.relaxation > 0 and not options.clamp,
+                "relaxation keeps particles in the box: leave model.clamp=true",
+            ),
+            (
+                options.relaxation > 0 and options.neighbours is not None,
+                "relaxation needs all neighbours: leave model.neighbours out",
+            ),
+            (
+                options.link_weight is not None and "link" not in self.operator.weights,
+                "link_weight is for operators that predict links, as supergat",
+            ),
         )
-
-    def _check_relaxation(self) -> None:
-        """Refuse options beside which rollouts cannot be relaxed.
-
-        Raises:
-            UsageError: particles may leave the box, or have a limited number of
-                neighbours.
-        """
-        options = self.options
-        if not options.relaxation:
-            return
-        if not options.clamp:
-            raise UsageError(
-                "relaxation keeps particles in the box: model.clamp=false; leave one "
-                "of the two out",
-                where="model.relaxation",
-            )
-        if options.neighbours is not None:
-            raise UsageError(
-                "relaxation needs all neighbours of a particle: "
-                f"model.neighbours={options.neighbours}; leave one of the two out",
-                where="model.relaxation",
-            )
+        for is_contradiction, words in contradictions:
+            if is_contradiction:
+                raise UsageError(f"model.{words}", where=self.method)
 
     def adapt_weights(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
@@ -602,7 +570,6 @@ class GraphNetwork(Baseline):
         for frame in range(first_frame, end_frame):
             following, operator_losses = self.step(state, generator)
             terms = self._step_terms(state, following, batch, frame)
-            self._check_names(terms, operator_losses)
             terms.update(operator_losses)
             step_terms.append(terms)
             state = following
@@ -699,16 +666,6 @@ class GraphNetwork(Baseline):
             norm=self.options.loss_norm,
             weights=self.weights,
         )
-
-    def _check_names(self, terms: Mapping[str, Tensor], losses: Losses) -> None:
-        """Refuse an operator's loss with the name of another term."""
-        repeated = terms.keys() & losses.keys()
-        if repeated:
-            raise UsageError(
-                "an operator's loss has the name of one of ours: "
-                f"{', '.join(sorted(repeated))}; rename it",
-                where=f"{self.operator.__qualname__}.forward",
-            )
 
     def _forget(
         self, state: ParticleState, windows: int, generator: torch.Generator
