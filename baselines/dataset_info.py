@@ -7,7 +7,7 @@ from pathlib import Path
 from lagbench.data.box import parse_obstacle
 from lagbench.data.layout import dataset_folder, has_file
 from lagbench.data.local import locate, suggest_repair
-from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
@@ -38,24 +38,23 @@ def read_dataset_info(
         raise DataError(
             f"the data set is not generated: no manifest; {hint}", where=str(folder)
         )
-    dataset_sha256 = _find_hash(manifest, tier)
-    if dataset_sha256 is None:
+    # Data at hand have the hash and the statistics of datasets.yaml where they are not
+    # complete; but not where they may have other bits.
+    dataset_sha256 = manifest.dataset_sha256
+    statistics = manifest.statistics
+    if tier.measured is not None:
+        if not dataset_sha256 and manifest.identity == "bitwise":
+            dataset_sha256 = tier.measured.dataset_sha256
+        statistics = statistics or tier.measured.statistics
+    if not manifest.files or dataset_sha256 is None or not statistics:
         raise DataError(
-            f"the data set is not complete: got {len(manifest.files)} of them, "
-            f"expected all {len(tier.scenarios)} scenarios; {hint}",
+            f"{len(manifest.files)} of {len(tier.scenarios)} scenarios are there; "
+            f"{hint}",
             where=str(folder),
         )
-    if not manifest.files:
-        raise DataError(
-            f"the data set is empty: expected {len(tier.scenarios)} scenarios; {hint}",
-            where=str(folder),
-        )
-    statistics = _find_statistics(manifest, tier)
-    if not statistics:
-        raise DataError(
-            f"the subset train is not complete, its statistics are unknown; {hint}",
-            where=str(folder),
-        )
+    rows = {}
+    for name, row in statistics.items():
+        rows[name] = tuple(float(value) for value in row)
 
     first_file = manifest.files[0]
     update_working_copy(tier, root_folder, [first_file.scenario])
@@ -78,7 +77,7 @@ def read_dataset_info(
         score_placement=task.score_grid.placement,
         frame_interval=tier.frame_interval,
         moving_walls=moving_walls,
-        statistics=statistics,
+        statistics=rows,
     )
 
 
@@ -107,29 +106,3 @@ def find_forcing(size: Size, root: Path) -> frozenset[str]:
         if parse_obstacle(header.parameters, size.dimension, where=where) is not None:
             forcing.add("obstacle")
     return frozenset(forcing)
-
-
-def _find_hash(manifest: Manifest, size: Size) -> str | None:
-    """Return the hash of the data at hand, else that of datasets.yaml.
-
-    Incomplete data that may have other bits than those of datasets.yaml have no hash.
-    """
-    if manifest.dataset_sha256:
-        return manifest.dataset_sha256
-    if size.measured is not None and manifest.identity == "bitwise":
-        return size.measured.dataset_sha256
-    return None
-
-
-def _find_statistics(manifest: Manifest, size: Size) -> dict[str, tuple[float, ...]]:
-    """Return the statistics of the data at hand, else those of datasets.yaml.
-
-    Without train there are none at hand.
-    """
-    statistics = manifest.statistics
-    if not statistics and size.measured is not None:
-        statistics = size.measured.statistics
-    rows = {}
-    for name, row in statistics.items():
-        rows[name] = tuple(float(value) for value in row)
-    return rows

@@ -84,36 +84,21 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
             the box is another one.
     """
     check_moving_walls(options.wall_velocity, info)
-    _check_box(options, info)
+    # These options need a square box with walls on all four sides.
+    if info.box.dimension != 2 or info.box.is_periodic:
+        for name in ("conserve", "strain", "shape", "density"):
+            if getattr(options, name):
+                raise UsageError(
+                    f"model.{name} needs a two-dimensional box without periodic axes"
+                )
     materials = set(options.materials)
     is_repeated = len(materials) < len(options.materials)
     if not materials or is_repeated or not materials <= set(range(MATERIALS)):
         raise UsageError(
-            f"materials are named once each: got {list(options.materials)}, expected "
-            f"some of {list(range(MATERIALS))}; name each material once: --set "
-            "model.materials",
-            where="model.materials",
+            f"model.materials={list(options.materials)}; name some of "
+            f"{list(range(MATERIALS))}, each once"
         )
     if options.average and options.symmetry is Symmetry.NONE:
         raise UsageError(
-            f"there are no mirror images to average over: got {options.symmetry}, "
-            f"expected model.symmetry {Symmetry.MIRROR} or {Symmetry.SQUARE}; set "
-            "model.symmetry=mirror too, or leave model.average out",
-            where="model.average",
+            "model.average is a mean over mirror images; set model.symmetry=mirror too"
         )
-
-
-def _check_box(options: NeuralMPMOptions, info: DatasetInfo) -> None:
-    """Refuse options that the box of the data set does not allow."""
-    box = info.box
-    if box.dimension == 2 and not box.is_periodic:
-        return
-    # These options need a square box with walls on all four sides.
-    for name in ("conserve", "strain", "shape", "density"):
-        value = getattr(options, name)
-        if value:
-            raise UsageError(
-                f"{name} needs a two-dimensional box without periodic axes: {value}; "
-                "leave the option out",
-                where=f"model.{name}",
-            )
