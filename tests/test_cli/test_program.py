@@ -77,7 +77,7 @@ def test_the_help_of_a_command_ends_with_an_example_that_parses(
         ("predict nothere.pt", 3),
         ("plot cavity --size full", 4),
         ("compare a.nc", 2),
-        ("submit nothere.nc --method m", 3),
+        ("submit nothere.nc --method m", 2),
         ("leaderboard shw", 2),
         ("leaderboard show cavity --size huge", 2),
         ("list --root ", 2),
