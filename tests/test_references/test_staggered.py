@@ -148,6 +148,35 @@ def test_a_beltrami_flow_decays_in_three_dimensions() -> None:
     assert 3.3 < errors[0] / errors[1] < 4.7
 
 
+@pytest.mark.parametrize(("upwinding", "order"), [(None, 2), (0.0, 4), (1.0, 3)])
+def test_a_stream_carries_a_shear_wave(upwinding: float | None, order: int) -> None:
+    """The error falls with the order of the scheme; only the upwind part takes energy."""
+    errors = []
+    for count in (32, 64):
+        box = Box.from_bounds([(0.0, 1.0), (0.0, 1.0)], periodic=[True, True])
+        grid = StaggeredGrid(
+            box, cells=(count, count), no_slip=False, upwinding=upwinding
+        )
+
+        def wave(place: np.ndarray) -> np.ndarray:
+            across = np.sin(WAVE * place[..., 0])
+            return np.stack([np.ones_like(across), across], -1)
+
+        def slope(place: np.ndarray) -> np.ndarray:
+            along = -WAVE * np.cos(WAVE * place[..., 0])
+            return np.stack([np.zeros_like(along), along], -1)
+
+        velocity = faces(grid, wave)
+        rate = grid.acceleration(velocity, viscosity=0.0, wall_velocity=NO_WALLS)
+        errors.append(largest_error(rate, faces(grid, slope)))
+        power = float(np.mean(velocity[1] * rate[1]))
+        if upwinding:
+            assert power < 0.0
+        else:
+            assert abs(power) < 1e-12
+    assert errors[0] / errors[1] > 0.95 * 2**order
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_roughest_flow_decays(dimension: int) -> None:
     """Viscosity alone damps what a grid resolves least, in as few steps as are taken.
