@@ -97,6 +97,13 @@ def fit(
     ranges = row.ranges(task.size)
     names = list(ranges)
     box = np.array(list(ranges.values()))
+
+    def measured(point: Floats) -> float:
+        constants = dict(zip(names, point.tolist(), strict=True))
+        error = error_of(row, constants, task)
+        report(f"{row.name} {constants}: {error:.5g}")
+        return error
+
     best: tuple[float, Floats] = (np.inf, box.mean(axis=1))
     widths = (1.0, SMALLER) if row.is_smooth else (1.0,)
     for width in widths:
@@ -105,14 +112,6 @@ def fit(
         high = np.minimum(box[:, 1], best[1] + half)
         ends = np.stack([low, high], axis=1)
         points = spread_points(ends, POINTS_PER_TERM * count_terms(len(names)))
-        errors = []
-
-        def measured(point: Floats) -> float:
-            constants = dict(zip(names, point.tolist(), strict=True))
-            error = error_of(row, constants, task)
-            report(f"{row.name} {constants}: {error:.5g}")
-            return error
-
         errors = np.array([measured(point) for point in points])
         lowest = minimum_of_surface(points, np.log(errors), ends)
         points = np.vstack([points, lowest])
