@@ -150,7 +150,7 @@ def test_a_beltrami_flow_decays_in_three_dimensions() -> None:
 
 @pytest.mark.parametrize(("upwinding", "order"), [(None, 2), (0.0, 4), (1.0, 3)])
 def test_a_stream_carries_a_shear_wave(upwinding: float | None, order: int) -> None:
-    """The error falls with the order of the scheme; only the upwind part takes energy."""
+    """The error falls with the order; only the upwind part takes energy."""
     errors = []
     for count in (32, 64):
         box = Box.from_bounds([(0.0, 1.0), (0.0, 1.0)], periodic=[True, True])
