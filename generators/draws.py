@@ -154,8 +154,10 @@ def draw_offsets(
         shape: particles and axes.
         subdivision: the factor by which the lattice is finer along each axis.
     """
-    particles, dimension = shape
-    unit = rng.random((particles // subdivision**dimension, dimension))
+    coarse_count, dimension = shape
+    for _ in range(dimension):
+        coarse_count //= subdivision
+    unit = rng.random((coarse_count, dimension))
     if subdivision > 1:
         # four words of 53 bits seed the finer stream
         words = [int(value * 2.0**53) for value in unit.ravel()[:4].tolist()]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,6 @@ from lagbench.generators.constants import solver_constants
 from lagbench.generators.record import replace_measured
 from lagbench.generators.refinement import recorded_particles, refined
 from lagbench.generators.solver import build
-from lagbench.generators.split import InitialState
 from lagbench.metrics.table import ranking_metric
 
 from .distance import error_between
@@ -38,46 +37,64 @@ from .distance import error_between
 SCENARIOS = 3
 """Test scenarios of which the mean is taken."""
 
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """The recorded particles of a run."""
-
-    state: InitialState  # at refinement 1, before the first substep
-    position: NDArray[np.float32]  # [length], shape [frame, particle, axis]
+Singles = NDArray[np.float32]
 
 
-def simulate(size: Size, scenario: int, refinement: int) -> Run:
-    """Run a scenario to the end of its horizon; nothing is written."""
-    coarse = draw_initial_state(size, scenario)
+def simulate(
+    size: Size, scenario: int, refinement: int, like: Singles | None = None
+) -> Singles:
+    """Run a scenario to the end of its horizon; nothing is written.
+
+    Args:
+        size: the split and size.
+        scenario: id.
+        refinement: that of the run.
+        like: positions in the last given frame [length], shape [particle, axis]. Where
+            given, the particles that are nearest to them then are recorded, from that
+            frame on; else those of the files, from frame 0 on.
+
+    Returns:
+        Positions [length], shape [frame, particle, axis].
+    """
     fine_size = refined(size, refinement)
     state = draw_initial_state(fine_size, scenario)
+    coarse = draw_initial_state(size, scenario)
+    solver = build(solver_constants(fine_size), threads=1)
+    solver.load([state])
+    last_given = size.task.input_frames - 1
+    first = 0 if like is None else last_given
+    solver.advance((state.start_frame + first) * fine_size.substeps_per_frame)
+    if like is not None:
+        coarse = replace(coarse, position=like.astype(np.float64))
+        state = replace(state, position=solver.position()[0].astype(np.float64))
     particles = np.arange(size.particles)
     if refinement > 1:
         particles = recorded_particles(coarse, state)
-    solver = build(solver_constants(fine_size), threads=1)
-    solver.load([state])
-    solver.advance(state.start_frame * fine_size.substeps_per_frame)
     frames = [solver.position()[0, particles]]
-    for _ in range(1, size.task.input_frames + size.task.horizon):
+    for _ in range(first + 1, size.task.input_frames + size.task.horizon):
         solver.advance(fine_size.substeps_per_frame)
         frames.append(solver.position()[0, particles])
-    return Run(coarse, np.stack(frames))
+    return np.stack(frames)
 
 
 def truth_error(size: Size, scenario: int) -> float:
-    """Return the ranking metric between the truth and a run twice as fine."""
+    """Return the ranking metric between the truth and a run twice as fine.
+
+    Both follow the particles that are in the same places in the last given frame.
+    """
     truth = simulate(size, scenario, size.refinement)
-    finer = simulate(size, scenario, 2 * size.refinement)
     first = size.task.input_frames
+    last_given = truth[first - 1]
+    finer = simulate(size, scenario, 2 * size.refinement, like=last_given)
+    state = draw_initial_state(size, scenario)
     return error_between(
         size,
-        truth.position[first:],
-        finer.position[first:],
-        given=finer.position[:first],
-        previous=truth.position[first - 1],
-        material=truth.state.material,
-        area=truth.state.area,
+        finer[1:],
+        truth[first:],
+        given=truth[:first],
+        previous=finer[0],
+        material=state.material,
+        area=state.area,
     )
 
 
