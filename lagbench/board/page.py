@@ -2,13 +2,15 @@
 
 Jinja2 escapes all text, that of strangers too. All numbers of the tables are plain
 HTML; a small script sorts, filters and shows one data set at a time. The charts are
-Vega-Lite specifications that Vega draws, whose code stands in the page.
+Vega-Lite specifications (https://vega.github.io): Vega draws them in the page, which
+has its code, and vl-convert writes them to files.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -20,10 +22,51 @@ from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, check_installed
 from lagbench.metrics.table import METRICS
 
+from .collect import collect
 from .columns import SHOWN_METRICS, best_of, columns_of, format_number
 from .entry import schema_bytes
 from .folder import PAGE, SCHEMA, Folder
-from .rows import Board, Tab, collect, conclude
+from .rows import Board, Row, Tab, conclude
+
+Spec = dict[str, Any]
+
+VEGA_LITE = "https://vega.github.io/schema/vega-lite/v5.json"
+
+COLOURS = {
+    "learned": "#2a6fdb",
+    "hybrid": "#8e4ec6",
+    "calibrated": "#d9730d",
+    "classical": "#6b7684",
+    "naive": "#b4bac2",
+}
+"""Colour of each kind of row."""
+
+TRUTH_COLOUR = "#c2255c"
+
+SMALL = {"width": 190, "height": 130}  # a panel of the first picture [pixel]
+LARGE = {"width": "container", "height": 320}
+
+NAMED_ENTRIES = 3
+"""Entries that have their names beside their dots, best first."""
+
+CURVES = 5
+"""Entries that have a curve over frames, best first."""
+
+PANELS_IN_LINE = 4
+
+CONFIG = {
+    "view": {"stroke": None},
+    "axis": {"domain": False, "labelFontSize": 11, "titleFontSize": 12},
+    "title": {"fontSize": 12, "anchor": "start", "offset": 6},
+    "font": "system-ui, sans-serif",
+}
+
+KIND_COLOUR = {
+    "field": "kind",
+    "type": "nominal",
+    "legend": None,
+    "scale": {"domain": list(COLOURS), "range": list(COLOURS.values())},
+}
 
 VEGA_EMBED = "window.vegaEmbed = vegaEmbed;"
 """What the bundle of Vega gives to the script of the page."""
@@ -57,9 +100,9 @@ def build(
 
     Raises:
         ChecksFailedError: with ``check``, a file is stale; else see
-            :func:`.rows.collect`.
+            :func:`.collect.collect`.
         UsageError: no leaderboard, or the extra ``plots`` is not installed.
-        UnreadableFileError, DataError: see :func:`.rows.collect`.
+        UnreadableFileError, DataError: see :func:`.collect.collect`.
     """
     check_installed("vl_convert", extra="plots")
     folder = Folder(board)
@@ -94,8 +137,6 @@ def render(board: Board, documentation: str = "") -> str:
     """Return the page of a board."""
     import jinja2
     import vl_convert
-
-    from .charts import COLOURS, cost_chart, curve_chart, with_config
 
     files = resources.files(__package__) / "page"
     environment = jinja2.Environment(
@@ -158,3 +199,199 @@ def describe_goal(tab: Tab) -> str:
         milliseconds = format_number(1e3 * row.seconds)
         corners.append(f"{format_number(row.error)} in {milliseconds} ms")
     return ", ".join(corners)
+
+
+def cost_chart(tab: Tab, *, is_large: bool) -> Spec:
+    """Return error against cost: a dot per row, the hull of the classical side.
+
+    A dashed line shows the truth error: differences below it mean nothing.
+
+    Args:
+        tab: the data set.
+        is_large: whether axes have titles, and rows their names.
+    """
+    rows = [row for row in tab.rows if _has_place(row)]
+    entries = [row.id for row in rows if row.entry is not None]
+    named = {corner.name for corner in tab.hull} | set(entries[:NAMED_ENTRIES])
+    points: list[dict[str, Any]] = []
+    for row in rows:
+        point: dict[str, Any] = {
+            "method": row.name,
+            "kind": str(row.kind),
+            "ms": 1e3 * float(row.seconds or 0.0),
+            "error": float(f"{row.score.mean:.6g}"),
+            "label": row.name if row.id in named else "",
+        }
+        if row.speedup is not None:
+            point["speedup"] = str(row.speedup)
+        points.append(point)
+    costs = [point["ms"] for point in points]
+    errors = [point["error"] for point in points]
+    if tab.truth_error:
+        errors.append(tab.truth_error)
+
+    ticks = 5 if is_large else 3
+    x = _log_axis("ms", costs, ticks=ticks, room=4.0 if is_large else 1.5)
+    y = _log_axis("error", errors, ticks=ticks, room=1.2)
+    if is_large:
+        x["title"] = "processor time of a frame [ms]"
+        y["title"] = f"error ({tab.ranking.replace('_', ' ')})"
+    layers: list[Spec] = []
+    if tab.truth_error:
+        layers.append(
+            {
+                "data": {"values": [{"error": tab.truth_error}]},
+                "mark": {"type": "rule", "color": TRUTH_COLOUR, "strokeDash": [4, 3]},
+                "encoding": {"y": y},
+            }
+        )
+    if tab.hull:
+        layers.append(
+            {
+                "data": {"values": _hull_line(tab, costs, errors)},
+                "mark": {"type": "line", "color": COLOURS["classical"], "clip": True},
+                "encoding": {"x": x, "y": y, "order": {"field": "order"}},
+            }
+        )
+    tooltip = [{"field": name} for name in ("method", "kind", "error", "ms", "speedup")]
+    layers.append(
+        {
+            "mark": {
+                "type": "circle",
+                "opacity": 1,
+                "size": 80 if is_large else 36,
+                "stroke": "white",
+                "strokeWidth": 0.6,
+            },
+            "encoding": {"x": x, "y": y, "color": KIND_COLOUR, "tooltip": tooltip},
+        }
+    )
+    if is_large:
+        layers.append(
+            {
+                "mark": {"type": "text", "align": "left", "dx": 6, "dy": -7},
+                "encoding": {"x": x, "y": y, "text": {"field": "label"}},
+            }
+        )
+    chart: Spec = {"data": {"values": points}, "layer": layers}
+    if is_large:
+        return chart | LARGE
+    return chart | SMALL | {"title": tab.name}
+
+
+def _has_place(row: Row) -> bool:
+    """Tell whether a row has a place on logarithmic axes."""
+    return bool(row.seconds) and 0.0 < row.score.mean < math.inf
+
+
+def _log_axis(name: str, values: Sequence[float], *, ticks: int, room: float) -> Spec:
+    """Return the encoding of a logarithmic axis with some room beyond the values."""
+    domain = [0.1, 1.0]
+    if values:
+        domain = [min(values) / 1.3, max(values) * 1.3 * room]
+    return {
+        "field": name,
+        "type": "quantitative",
+        "title": None,
+        "scale": {"type": "log", "domain": domain, "nice": False},
+        "axis": {"tickCount": ticks, "format": "~g"},
+    }
+
+
+def _hull_line(
+    tab: Tab, costs: Sequence[float], errors: Sequence[float]
+) -> list[dict[str, float]]:
+    """Return the hull: upright above its first corner, level beyond its last."""
+    corners = [(1e3 * row.seconds, row.error) for row in tab.hull]
+    line = [
+        (corners[0][0], 2.0 * max(errors)),
+        *corners,
+        (100.0 * max(costs), corners[-1][1]),
+    ]
+    points = []
+    for order, (milliseconds, error) in enumerate(line):
+        points.append({"ms": milliseconds, "error": error, "order": order})
+    return points
+
+
+def curve_chart(tab: Tab) -> Spec | None:
+    """Return the ranking metric over frames; None where it has no value per frame.
+
+    It has the first entries, the best classical and the best naive row.
+    """
+    chosen = [row for row in tab.rows if row.entry is not None][:CURVES]
+    for is_classical in (True, False):
+        for row in tab.rows:
+            if row.entry is None and row.kind.is_on_classical_side is is_classical:
+                chosen.append(row)
+                break
+    points: list[dict[str, Any]] = []
+    names = []
+    for row in chosen:
+        if row.curve is None:
+            continue
+        names.append(row.name)
+        for frame, value in zip(row.curve.frames, row.curve.mean.tolist(), strict=True):
+            if value > 0.0:
+                error = float(f"{value:.4g}")
+                points.append({"frame": frame, "error": error, "method": row.name})
+    if not points:
+        return None
+    y = _log_axis("error", [point["error"] for point in points], ticks=5, room=1.0)
+    return LARGE | {
+        "data": {"values": points},
+        "mark": {"type": "line", "strokeWidth": 1.8},
+        "encoding": {
+            "x": {"field": "frame", "type": "quantitative", "scale": {"zero": False}},
+            "y": y | {"title": tab.ranking.replace("_", " ")},
+            "color": {
+                "field": "method",
+                "type": "nominal",
+                "sort": names,
+                "legend": {"orient": "bottom", "columns": 2, "title": None},
+            },
+            "tooltip": [{"field": name} for name in ("method", "frame", "error")],
+        },
+    }
+
+
+def with_config(chart: Mapping[str, Any]) -> Spec:
+    """Return a whole specification, which Vega-Lite draws on the colour behind it."""
+    return {"$schema": VEGA_LITE, "background": None, "config": CONFIG, **chart}
+
+
+def write_picture(board: Board, path: Path) -> None:
+    """Write the first picture of the page: a small panel for each data set.
+
+    Args:
+        board: the board.
+        path: the file to write, which ends in .svg or .png.
+    """
+    import vl_convert
+
+    panels: list[Spec] = [cost_chart(tab, is_large=False) for tab in board.tabs]
+    kinds = [{"kind": name} for name in COLOURS]
+    key = {
+        "title": "kinds",
+        "data": {"values": kinds},
+        "mark": {"type": "circle", "size": 60, "opacity": 1},
+        "encoding": {
+            "y": {"field": "kind", "title": None, "sort": list(COLOURS)},
+            "color": KIND_COLOUR,
+        },
+    }
+    picture = with_config(
+        {
+            "title": "error against processor time of a frame [ms]; the line is the "
+            "classical side",
+            "concat": [*panels, key],
+            "columns": PANELS_IN_LINE,
+            "background": "white",
+        }
+    )
+    text = json.dumps(picture)
+    if path.suffix.lower() == ".png":
+        data = vl_convert.vegalite_to_png(text, scale=2)
+    else:
+        data = vl_convert.vegalite_to_svg(text).encode()
+    write_atomically(path, data, option="--output")

@@ -15,11 +15,11 @@ from cyclopts.types import PositiveInt
 from lagbench.atomic import check_output_file
 from lagbench.board.blind import BlindScore, score_blind
 from lagbench.board.check import CheckResult, check_board
+from lagbench.board.collect import collect
 from lagbench.board.folder import Folder
 from lagbench.board.models import choose_data_sets
-from lagbench.board.page import build
+from lagbench.board.page import build, write_picture
 from lagbench.board.reproduce import TIMED_FRAMES, ReproduceResult, reproduce
-from lagbench.board.rows import collect
 from lagbench.board.shift import scores_of_seeds
 from lagbench.board.shift_run import ShiftResult, score_on_shift
 from lagbench.board.show import tables, to_plain
@@ -151,8 +151,6 @@ def picture_command(
         raise UsageError(f"{output} must end in .svg or .png; rename it")
     check_output_file(output, overwrite=overwrite)
     check_installed("vl_convert", extra="plots")
-    from lagbench.board.charts import write_picture
-
     folder = find_board(board, reads=True)
     chosen = choose_data_sets(Folder(folder).data_sets(), None, size, board=folder)
     write_picture(collect(folder, only=chosen, metrics=()), output)

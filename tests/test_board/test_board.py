@@ -23,12 +23,12 @@ from board_bench import (
 )
 from command_line import CliRunner
 
-from lagbench.board.charts import cost_chart, write_picture
 from lagbench.board.check import check_board
+from lagbench.board.collect import _rank, collect
 from lagbench.board.entry import Entry, entry_bytes, read_entry, validate
 from lagbench.board.folder import Folder
-from lagbench.board.page import build, render
-from lagbench.board.rows import Board, Tab, _rank, collect
+from lagbench.board.page import build, cost_chart, render, write_picture
+from lagbench.board.rows import Board, Tab
 from lagbench.board.show import to_plain
 from lagbench.board.verified import Level, read_verified
 from lagbench.cli.program import app
