@@ -62,28 +62,23 @@ class Box:
         """
         if not len(self.low) == len(self.high) == len(self.periodic):
             raise UsageError(
-                "the parts of a box differ in dimension",
+                f"the parts of a box differ in dimension: {len(self.low)}, "
+                f"{len(self.high)} and {len(self.periodic)}; give a low, a high and a "
+                "periodic value for each axis",
                 where="low, high, periodic",
-                expected="as many values in each",
-                got=f"{len(self.low)}, {len(self.high)} and {len(self.periodic)}",
-                fix="give a low, a high and a periodic value for each axis",
             )
         if self.dimension not in (2, 3):
             raise UsageError(
-                "a box has two or three dimensions",
+                f"a box has two or three dimensions: {self.dimension}; give a value "
+                "for each axis",
                 where="low",
-                expected="2 or 3 values",
-                got=self.dimension,
-                fix="give a value for each axis",
             )
         for axis, low, high in zip(AXES, self.low, self.high, strict=False):
             if not low < high:
                 raise UsageError(
-                    "an axis of a box has no extent",
+                    f"an axis of a box has no extent: {low} and {high}; exchange "
+                    "them, or correct one",
                     where=axis,
-                    expected="low < high",
-                    got=f"{low} and {high}",
-                    fix="exchange them, or correct one",
                 )
 
     @classmethod
@@ -356,11 +351,10 @@ def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
         fault = "periodic axes are named once each"
     if fault is not None:
         raise UsageError(
-            fault,
+            f"{fault}: got {', '.join(map(str, axes))}, expected axes of the box, "
+            f"each at most once: {', '.join(names)}; name axes of the box, as in "
+            f"{names[0]} or {','.join(names)}",
             where="periodic",
-            expected=f"axes of the box, each at most once: {', '.join(names)}",
-            got=", ".join(map(str, axes)),
-            fix=f"name axes of the box, as in {names[0]} or {','.join(names)}",
         )
     return tuple(name in axes for name in names)
 
@@ -409,20 +403,16 @@ def parse_obstacle(
         # no comparison holds for what is not a number
         if not is_number or not (abs(stated) <= LARGEST_FLOAT32).all():
             raise DataError(
-                "the obstacle has no place or no size",
+                f"the obstacle has no place or no size: {attributes.get(name)}; mend "
+                "the attribute, or make the file again",
                 where=f"{where}, attribute {name}",
-                expected="a finite number [length]",
-                got=attributes.get(name),
-                fix="mend the attribute, or make the file again",
             )
         values.append(float(stated.item()))
     if values[-1] <= 0.0:
         raise DataError(
-            "the obstacle has no size",
+            f"the obstacle has no size: {values[-1]}; mend the attribute, or make the "
+            "file again",
             where=f"{where}, attribute obstacle_diameter",
-            expected="a number above 0 [length]",
-            got=values[-1],
-            fix="mend the attribute, or make the file again",
         )
     values[-1] *= 0.5
     return np.array(values, np.float32)

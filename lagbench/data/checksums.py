@@ -90,9 +90,7 @@ def dtype_name(dtype: object) -> str:
     if resolved.kind in "iuf":
         return str(resolved.name)
     raise DataError(
-        "a type cannot be hashed",
-        expected="integers, floats or strings",
-        got=str(resolved),
+        f"a type cannot be hashed: {resolved}, expected integers, floats or strings"
     )
 
 
@@ -166,7 +164,7 @@ class VariableHasher:
 
     def _error(self, what: str, expected: object, got: object) -> DataError:
         return DataError(
-            what, where=f"variable {self.name!r}", expected=expected, got=got
+            f"{what}: got {got}, expected {expected}", where=f"variable {self.name!r}"
         )
 
 

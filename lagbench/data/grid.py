@@ -108,20 +108,15 @@ class Grid:
         """
         if self.cells < 2:
             raise UsageError(
-                "a grid needs cells",
-                where="cells",
-                expected="at least 2",
-                got=self.cells,
-                fix="give more cells",
+                f"a grid needs cells: {self.cells}; give more cells", where="cells"
             )
         object.__setattr__(self, "placement", Placement(self.placement))
         if not self.box.has_whole_cells(self.cells):
             raise UsageError(
-                "a periodic axis is no whole number of cells long",
+                f"a periodic axis is no whole number of cells long: {self.cells} "
+                f"cells across a length of 1, box {self.box.bounds}; another number "
+                "of cells",
                 where="cells",
-                expected="3 or more whole cells along every periodic axis",
-                got=f"{self.cells} cells across a length of 1, box {self.box.bounds}",
-                fix="another number of cells",
             )
 
     @property
@@ -321,11 +316,10 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     dimension = grid.dimension
     if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != dimension:
         raise UsageError(
-            "positions and velocities do not fit",
+            f"positions and velocities do not fit: got {x.shape} and {u.shape}, "
+            f"expected two arrays of one shape [..., particle, {dimension}]; give "
+            "both for the same particles",
             where="position and velocity",
-            expected=f"two arrays of one shape [..., particle, {dimension}]",
-            got=f"{x.shape} and {u.shape}",
-            fix="give both for the same particles",
         )
     scatter = scatter_in_box
     if dimension == 2 and not grid.box.is_periodic:

@@ -97,11 +97,9 @@ def read_beginning(path: Path, most: int) -> bytes:
             return stream.read(most)
     except OSError as error:
         raise UnreadableFileError(
-            "cannot open the file",
+            f"cannot open the file: {error.strerror or error}; check the path and "
+            "that you may read the file",
             where=str(path),
-            expected="a readable file",
-            got=error.strerror or error,
-            fix="check the path and that you may read the file",
         ) from error
 
 
@@ -117,11 +115,7 @@ def check_file(
     first_bytes = read_beginning(path, FIRST_BYTES)
     if not first_bytes.startswith(SIGNATURE):
         raise UnreadableFileError(
-            "not an HDF5 file",
-            where=str(path),
-            expected="HDF5, as netCDF4 is",
-            got=guess_format(first_bytes),
-            fix=fix,
+            f"not an HDF5 file: {guess_format(first_bytes)}; {fix}", where=str(path)
         )
 
 
@@ -162,11 +156,9 @@ def hdf5_errors(path: Path, variable: str | None = None) -> Iterator[None]:
             where = f"{path}, variable {variable!r}"
         message = " ".join(str(error).split())[:300]
         raise UnreadableFileError(
-            "HDF5 cannot read the file",
+            f"HDF5 cannot read the file: {type(error).__name__}: {message}; "
+            f"{WRITE_AGAIN}",
             where=where,
-            expected="an undamaged HDF5 file",
-            got=f"{type(error).__name__}: {message}",
-            fix=WRITE_AGAIN,
         ) from error
 
 
@@ -200,11 +192,9 @@ def open_netcdf(path: Path, mode: Literal["r", "w"] = "r") -> netCDF4.Dataset:
         return netCDF4.Dataset(path, mode, format="NETCDF4")
     except UnicodeEncodeError as error:
         raise UsageError(
-            "no netCDF file can have that name",
+            "no netCDF file can have that name: bytes that are no UTF-8; use another "
+            "name",
             where=str(path),
-            expected="a path in UTF-8",
-            got="bytes that are no UTF-8",
-            fix="use another name",
         ) from error
 
 
@@ -395,7 +385,6 @@ def to_plain(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [to_plain(item) for item in value]
     raise DataError(
-        "a value cannot be hashed",
-        expected="a finite number, a string without NUL, or lists and mappings of them",
-        got=repr(value),
+        f"a value cannot be hashed: {value!r}, expected a finite number, a string "
+        "without NUL, or lists and mappings of them"
     )

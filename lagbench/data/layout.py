@@ -205,11 +205,9 @@ def parse_ids(
         issue = "a number stands twice"
     if issue is not None:
         raise UsageError(
-            f"bad list of {noun}s {text!r}",
+            f"bad list of {noun}s {text!r}: got {issue}, expected {noun}s and ranges "
+            f"from 0 to {MAX_ID}, as in 0,3-5; {fix}",
             where=where,
-            expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
-            got=issue,
-            fix=fix,
         )
     return tuple(ids)
 
@@ -258,11 +256,8 @@ def expand_path(path: str | Path, where: str) -> Path:
         return Path(path).expanduser().absolute()
     except RuntimeError as error:
         raise UsageError(
-            "there is no such home folder",
+            f"there is no such home folder: {str(path)!a}; write the whole path",
             where=where,
-            expected="a folder, or ~ for your own home folder",
-            got=ascii(str(path)),
-            fix="write the whole path",
         ) from error
 
 
@@ -290,11 +285,8 @@ def no_home_error(where: str) -> UsageError:
         where: the option or variable that names another folder.
     """
     return UsageError(
-        "you have no home folder",
+        f"you have no home folder: no home folder; set HOME, or name a folder: {where}",
         where=where,
-        expected="a folder, or a home folder",
-        got="no home folder",
-        fix=f"set HOME, or name a folder: {where}",
     )
 
 
@@ -337,11 +329,9 @@ def refuse_closed_folder(path: Path) -> None:
     if folder is not None:
         name = shlex.quote(str(folder))
         raise ClosedFolderError(
-            "a folder of data may not be read",
+            "a folder of data may not be read: permission denied; see who owns it: ls "
+            f"-ld {name}; chmod +rx {name} lets others read it",
             where=str(folder),
-            expected="permission to read it",
-            got="permission denied",
-            fix=f"see who owns it: ls -ld {name}; chmod +rx {name} lets others read it",
         )
 
 

@@ -126,11 +126,9 @@ def _check_folder_name(folder: Path) -> None:
             return
         name = str(folder)
         raise UsageError(
-            "no folder can have that name",
+            f"no folder can have that name: {name[:60]!a}..., {len(name)} characters; "
+            "name another folder",
             where=_ROOT_OPTION,
-            expected="a path",
-            got=f"{name[:60]!a}..., {len(name)} characters",
-            fix="name another folder",
         ) from error
 
 
@@ -141,11 +139,9 @@ def _refuse_file(folder: Path) -> None:
             return
         if os.path.exists(place):
             raise UsageError(
-                "the root is no folder",
+                f"the root is no folder: {place}, which is a file; name a folder; "
+                "without a root the folder for user data is taken",
                 where=_ROOT_OPTION,
-                expected="a folder, or a place where one can be made",
-                got=f"{place}, which is a file",
-                fix="name a folder; without a root the folder for user data is taken",
             )
 
 
@@ -166,11 +162,9 @@ def _named_root(root: str | Path | None) -> str | Path | None:
     text = str(root)
     if not text.strip() or _SCHEME_ALONE.fullmatch(text):
         raise UsageError(
-            "this cannot be a root folder",
+            f"this cannot be a root folder: {text!a}; name a folder; without a root "
+            "the folder for user data is taken",
             where=_ROOT_OPTION,
-            expected="a folder, or s3://bucket/prefix",
-            got=ascii(text),
-            fix="name a folder; without a root the folder for user data is taken",
         )
     return root
 
@@ -213,11 +207,8 @@ class RootedRegistry(Registry):
         if name not in self.splits:
             known_names = (*self.splits, *self.local_names())
             raise UsageError(
-                f"no split {name!r}",
+                f"no split {name!r}; {suggest_split(name, known_names)}",
                 where=SPLIT_NAMED,
-                expected="the name of a split, or the folder of a local one",
-                got=ascii(name),
-                fix=suggest_split(name, known_names),
             )
         return self.splits[name]
 
@@ -289,21 +280,19 @@ def _read_description(path: Path, name: str) -> tuple[Split, Mapping[str, Measur
     registry = load(path)
     if list(registry.splits) != [name]:
         raise UnreadableFileError(
-            "the folder is not named like its split",
+            "the folder is not named like its split: got "
+            f"{', '.join(registry.splits) or 'none'}, expected one split, {name!r}; "
+            "rename the folder back: the name is part of every hash",
             where=str(path),
-            expected=f"one split, {name!r}",
-            got=", ".join(registry.splits) or "none",
-            fix="rename the folder back: the name is part of every hash",
         )
     split = registry.splits[name]
     # A dotted path would be imported: a description must not choose code to run.
     if split.generator != NO_GENERATOR:
         raise UnreadableFileError(
-            "a local split cannot name a generator",
+            f"a local split cannot name a generator: got {split.generator}, expected "
+            f"{NO_GENERATOR}; an installed package adds splits that are simulated: "
+            "see examples/",
             where=f"{path}, key splits.{name}.generator",
-            expected=NO_GENERATOR,
-            got=split.generator,
-            fix="an installed package adds splits that are simulated: see examples/",
         )
     return split, registry.measured.get(name, {})
 
@@ -339,11 +328,9 @@ def locate_split(
     if not text.strip():
         # As a path it would mean the current folder.
         raise UsageError(
-            "the name of the split is empty",
+            f"the name of the split is empty: {text!a}; name one, as in --split "
+            "cavity; --split . takes the current folder",
             where=SPLIT_NAMED,
-            expected="the name of a split, or the folder of a local one",
-            got=ascii(text),
-            fix="name one, as in --split cavity; --split . takes the current folder",
         )
     path = Path(os.path.abspath(expand_path(text, "--split")))
     has_separator = "/" in text or os.sep in text or text in {".", "..", "~"}
@@ -370,29 +357,23 @@ def _locate_folder(
     parent = folder.parent
     if root is not None and resolve_root(root).resolve() != parent.resolve():
         raise UsageError(
-            "a path and another root name the split",
+            f"a path and another root name the split: got {root}, expected the root "
+            f"{parent}; give the path alone, or the root and the split's name",
             where="the split (SPLIT or --split) and --root",
-            expected=f"the root {parent}",
-            got=root,
-            fix="give the path alone, or the root and the split's name",
         )
     if not has_file(folder / DESCRIPTION) or not is_split_name(name):
         raise UsageError(
-            "no local split there",
+            f"no local split there: got {folder}, expected the name of a split, or a "
+            f"folder that holds {DESCRIPTION}, named like its split; lagbench list "
+            "names the splits; lagbench import makes local ones",
             where=SPLIT_NAMED,
-            expected=f"the name of a split, or a folder that holds {DESCRIPTION}, "
-            f"named like its split",
-            got=folder,
-            fix="lagbench list names the splits; lagbench import makes local ones",
         )
     rooted_registry = load_rooted_registry(parent, registry)
     if name not in rooted_registry.local_names():
         raise UsageError(
-            f"the name {name!r} is taken by another split",
+            f"the name {name!r} is taken by another split; import or adopt the data "
+            "again under another name",
             where=str(folder),
-            expected="a name that no split of lagbench or of a package has",
-            got=ascii(name),
-            fix="import or adopt the data again under another name",
         )
     rooted_registry.split(name)
     return SplitLocation(name, parent, rooted_registry)
@@ -494,11 +475,10 @@ def _size_error(
     if sizes_with_data:
         names_with_data = ", ".join(size.name for size in sizes_with_data)
         return UsageError(
-            "several sizes are there: name one",
+            f"several sizes are there: name one: got {names_with_data} in "
+            f"{url or location.root}, expected {size_names}; --size "
+            f"{sizes_with_data[0].name}",
             where="--size",
-            expected=size_names,
-            got=f"{names_with_data} in {url or location.root}",
-            fix=f"--size {sizes_with_data[0].name}",
         )
 
     if is_to_remove:
@@ -514,11 +494,9 @@ def _size_error(
         size = location.registry.size(location.name, _size_to_make(location))
         hint = suggest_repair(size, root=location.root)
     return DataError(
-        what,
+        f"{what}: got no data of {location.name} in {url or location.root}, expected "
+        f"{size_names}; {hint}",
         where="--size",
-        expected=size_names,
-        got=f"no data of {location.name} in {url or location.root}",
-        fix=hint,
     )
 
 
@@ -574,11 +552,9 @@ def check_contents(size: Size, root: Path, scenarios: Iterable[int]) -> None:
         expected = _expected_hash(size, scenario, manifest)
         if not content.startswith(expected):
             raise DataError(
-                f"a {subset} scenario has another content hash",
+                f"a {subset} scenario has another content hash: got {content}, "
+                f"expected {expected}; {hint}",
                 where=str(path),
-                expected=expected,
-                got=content,
-                fix=hint,
             )
     record_hashes(folder, new_hashes)
 
@@ -599,19 +575,12 @@ def _content_hash(
         new_hashes[path] = check_scenario(path)
     except OSError as error:
         raise DataError(
-            f"cannot read a {subset} scenario",
+            f"cannot read a {subset} scenario: {error.strerror}; {hint}",
             where=str(path),
-            expected="a readable file",
-            got=error.strerror,
-            fix=hint,
         ) from error
     except DataError as error:
         raise DataError(
-            error.what,
-            where=error.where or str(path),
-            expected=error.expected,
-            got=error.got,
-            fix=hint,
+            f"{error.text}; {hint}", where=error.where or str(path)
         ) from error
     return new_hashes[path]
 

@@ -70,11 +70,10 @@ def dataset_lock(
         lock = _acquire(folder, timeout, on_wait)
     except OSError as error:
         raise WorkFailedError(
-            "cannot write there, so the data set cannot be locked",
+            "cannot write there, so the data set cannot be locked: "
+            f"{error.strerror or error}; name a folder that you may write to: --root "
+            "or LAGBENCH_ROOT",
             where=str(error.filename or folder),
-            expected="a folder that can be written to",
-            got=error.strerror or error,
-            fix="name a folder that you may write to: --root or LAGBENCH_ROOT",
         ) from error
     try:
         holder = Holder(
@@ -106,11 +105,10 @@ def _acquire(
         lock.acquire(timeout=-1 if timeout is None else timeout)
     except filelock.Timeout:
         raise WorkFailedError(
-            "another process writes this data set",
+            "another process writes this data set: "
+            f"{read_holder(folder) or first_holder}; wait until it ends, or end it; "
+            "files that are complete stay",
             where=str(folder),
-            expected="no other writer",
-            got=str(read_holder(folder) or first_holder),
-            fix="wait until it ends, or end it; files that are complete stay",
         ) from None
     return lock
 

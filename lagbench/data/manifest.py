@@ -34,7 +34,7 @@ from .checksums import (
     round_digits,
     subset_hash,
 )
-from .field_errors import describe_expectation, describe_input
+from .field_errors import describe_faults
 from .layout import (
     MANIFEST_NAME,
     ScenarioKey,
@@ -315,34 +315,22 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
         check_regular(path, longest=MANIFEST_LIMIT)
         text = path.read_bytes()
     except (OSError, UnreadableFileError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error.got
         raise DataError(
-            "cannot read the manifest",
-            where=str(path),
-            expected="a readable file",
-            got=reason,
-            fix="see that you may read it, and that it is a file",
+            f"cannot read the manifest: {error}", where=str(path)
         ) from error
     try:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
-        first_error = error.errors()[0]
-        key = ".".join(str(part) for part in first_error["loc"])
         raise DataError(
-            "the manifest is damaged",
-            where=f"{path}, key {key or '(whole file)'}",
-            expected="the manifest that lagbench writes, here "
-            f"{describe_expectation(first_error)}",
-            got=describe_input(first_error),
-            fix=_MANIFEST_HINT,
+            f"the manifest is damaged: {describe_faults(error)}; {_MANIFEST_HINT}",
+            where=str(path),
         ) from None
     if not manifest.is_of(split, size, major):
         raise DataError(
-            "the manifest is of another data set",
+            f"the manifest is of another data set: got {manifest.split} "
+            f"{manifest.size}, version {manifest.version}, expected {split} {size}, "
+            f"version {major}; {_MANIFEST_HINT}",
             where=str(path),
-            expected=f"{split} {size}, version {major}",
-            got=f"{manifest.split} {manifest.size}, version {manifest.version}",
-            fix=_MANIFEST_HINT,
         )
     return manifest
 

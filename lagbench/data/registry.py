@@ -29,7 +29,6 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
-from pydantic_core import ErrorDetails
 
 from lagbench.errors import (
     SPLIT_NAMED,
@@ -42,7 +41,7 @@ from lagbench.errors import (
 
 from .box import Box, parse_periodic
 from .checksums import HASHED_SUBSETS, dataset_hash
-from .field_errors import describe_expectation, describe_input, is_own_sentence
+from .field_errors import describe_faults
 from .grid import MOST_NODES, Grid, Placement, most_cells
 from .layout import (
     ScenarioKey,
@@ -116,7 +115,7 @@ def _parse_ids(value: str | int) -> tuple[int, ...]:
     try:
         return parse_ids(value)
     except UsageError as error:
-        raise ValueError(f"{error.what}: {error.got}") from None
+        raise ValueError(error.text) from None
 
 
 Ids = Annotated[tuple[int, ...], BeforeValidator(_parse_ids)]
@@ -240,7 +239,7 @@ class _SizeEntry(_RegistryModel):
             periodic = parse_periodic(self.periodic, len(self.bounds))
             box = Box.from_bounds(self.bounds, periodic)
         except UsageError as error:
-            text = f"{error.what}: expected {error.expected}, got {error.got}"
+            text = error.text
             raise ValueError(text) from None
         if box.lengths.min() < SHORTEST_SIDE:
             raise ValueError(
@@ -306,12 +305,10 @@ class Size(BaseModel):
         choices = [name for name in SCORED_SUBSETS if name in self.subsets]
         if subset not in choices:
             raise UsageError(
-                f"no scored subset {subset!r}",
+                f"no scored subset {subset!r}: expected {' or '.join(choices)}; "
+                f"{suggest_name(subset, choices)}; `lagbench info {self.split}` shows "
+                "the subsets of each size",
                 where=f"{self.split} {self.name}",
-                expected=" or ".join(choices),
-                got=ascii(subset),
-                fix=f"{suggest_name(subset, choices)}; `lagbench info {self.split}` "
-                "shows the subsets of each size",
             )
         return self.model_copy(update={"scored_subset": subset})
 
@@ -357,11 +354,8 @@ class Size(BaseModel):
         """Return a parameter's value."""
         if name not in self.parameters:
             raise UsageError(
-                f"no parameter {name!r}",
+                f"no parameter {name!r}; {suggest_name(name, self.parameters)}",
                 where=f"{self.record_name}, {self.split} {self.name}",
-                expected="a parameter of the split",
-                got=ascii(name),
-                fix=suggest_name(name, self.parameters),
             )
         return self.parameters[name].value
 
@@ -448,11 +442,9 @@ class Size(BaseModel):
                 return subset
             texts.append(f"{subset} {format_ids(ids)}")
         raise UsageError(
-            f"no scenario {scenario}",
+            f"no scenario {scenario}: expected {', '.join(texts)}; name one of these; "
+            "`lagbench info` lists those of other sizes",
             where=f"{self.split} {self.name}",
-            expected=", ".join(texts),
-            got=scenario,
-            fix="name one of these; `lagbench info` lists those of other sizes",
         )
 
     def key(self, scenario: int) -> ScenarioKey:
@@ -487,11 +479,10 @@ class Size(BaseModel):
             if scenario in ids:
                 return count
         raise UsageError(
-            f"no scenario {scenario}",
+            f"no scenario {scenario}: expected an id among "
+            f"{format_ids(self.scenarios)}; name one of these; `lagbench info "
+            f"{self.split}` shows their subsets",
             where=f"{self.split} {self.name}, frames",
-            expected=f"an id among {format_ids(self.scenarios)}",
-            got=scenario,
-            fix=f"name one of these; `lagbench info {self.split}` shows their subsets",
         )
 
     @property
@@ -610,11 +601,8 @@ class Registry:
         """
         if name not in self.splits:
             raise UsageError(
-                f"no split {name!r}",
+                f"no split {name!r}; {suggest_split(name, self.splits)}",
                 where=SPLIT_NAMED,
-                expected="the name of a split; `lagbench list` shows all",
-                got=ascii(name),
-                fix=suggest_split(name, self.splits),
             )
         return self.splits[name]
 
@@ -634,11 +622,9 @@ class Registry:
                 )
             names = " or ".join(parent.sizes)
             raise UsageError(
-                f"split {split!r} has no size {name!r}",
+                f"split {split!r} has no size {name!r}: expected {names}; name "
+                f"{names}; `lagbench list {split}` says what they cost",
                 where="--size",
-                expected=names,
-                got=ascii(name),
-                fix=f"name {names}; `lagbench list {split}` says what they cost",
             )
         entry = parent.sizes[name]
         parameters = {}
@@ -756,7 +742,7 @@ def _add_split(registry: Registry, point: EntryPoint) -> Registry:
     module = point.load()
     if not hasattr(module, "REGISTRY"):
         expected = "an attribute REGISTRY: the path of its datasets.yaml"
-        raise UsageError("its module has no registry", expected=expected)
+        raise UsageError(f"its module has no registry: expected {expected}")
     path = Path(module.REGISTRY)
     plugin_file = _read_registry_file(path)
     split = Registry(plugin_file.splits, {}).split(name)
@@ -788,25 +774,8 @@ def _read_registry_file(path: Path) -> _RegistryFile:
     try:
         return _RegistryFile.model_validate(content)
     except ValidationError as error:
-        lines = [""]
-        for detail in error.errors()[:10]:
-            lines.append(_describe_validation_error(detail))
         raise UnreadableFileError(
-            f"{error.error_count()} mistake(s) in the registry",
+            f"{error.error_count()} mistake(s) in the registry, see docs/extending.md:"
+            f"\n    {describe_faults(error)}",
             where=str(path),
-            expected="a registry as docs/extending.md describes it",
-            got="\n    ".join(lines),
-            fix="mend the keys named above",
         ) from None
-
-
-def _describe_validation_error(detail: ErrorDetails) -> str:
-    """Return key, expected value and, where it is short, the value that is wrong."""
-    key = ".".join(str(part) for part in detail["loc"])
-    message = describe_expectation(detail)
-    if not is_own_sentence(detail):
-        message = f"expected {message}"
-    is_short = isinstance(detail["input"], str | int | float)
-    if is_short and "; got " not in message:
-        return f"{key}: {message}; got {describe_input(detail)}"
-    return f"{key}: {message}"

@@ -130,11 +130,8 @@ def select_parameters(
     for name in str(names).split():
         if name not in attributes:
             raise DataError(
-                "a parameter is missing",
+                "a parameter is missing: no such attribute; make the file again",
                 where=f"{where}, attribute {name}",
-                expected="a value, as hashed_parameters names it",
-                got="no such attribute",
-                fix="make the file again",
             )
         parameters[name] = attributes[name]
     return parameters
@@ -162,11 +159,10 @@ def _parse_number(stated: object, name: str, *, unit: str, where: str) -> float 
     number = float(values.item()) if is_number else math.nan
     if not 0.0 <= number < math.inf:
         raise DataError(
-            f"the {name} has an impossible value",
+            f"the {name} has an impossible value: got {str(stated)[:MOST_LETTERS]}, "
+            f"expected a finite number from 0 [{unit}]; mend the attribute, or make "
+            "the file again",
             where=f"{where}, attribute {name}",
-            expected=f"a finite number from 0 [{unit}]",
-            got=str(stated)[:MOST_LETTERS],
-            fix="mend the attribute, or make the file again",
         )
     return number
 
@@ -275,11 +271,9 @@ class ScenarioFile:
         unhashed = sorted((STATED_NAMES & names) - self.header.parameters.keys())
         if unhashed:
             raise DataError(
-                "the file states parameters that no hash covers",
+                "the file states parameters that no hash covers: "
+                f"{', '.join(unhashed)}; {_repair_hint(self.path)}",
                 where=f"{self.path}, attributes",
-                expected="each of them in hashed_parameters",
-                got=", ".join(unhashed),
-                fix=_repair_hint(self.path),
             )
         for name, variable in sorted(self._variables.items()):
             with _damage_errors(self.path, name):
@@ -293,11 +287,9 @@ class ScenarioFile:
                     value = str(attributes.get(key, "missing"))
                     values.append(f"{key} = {value}"[:MOST_LETTERS])
                 raise DataError(
-                    "attributes of a variable are not those of the format",
+                    "attributes of a variable are not those of the format: "
+                    f"{', '.join(values)}; {_repair_hint(self.path)}",
                     where=f"{self.path}, variable {name!r}",
-                    expected="those of docs/format.md",
-                    got=", ".join(values),
-                    fix=_repair_hint(self.path),
                 )
 
     def stored_hashes(self) -> dict[str, object]:
@@ -397,11 +389,9 @@ def _hash_error(
     what: str, *, where: str, expected: object, got: str, path: Path
 ) -> DataError:
     return DataError(
-        what,
+        f"{what}: got {got}, expected "
+        f"{str(expected or 'a stored hash')[:MOST_LETTERS]}; {_repair_hint(path)}",
         where=where,
-        expected=str(expected or "a stored hash")[:MOST_LETTERS],
-        got=got,
-        fix=_repair_hint(path),
     )
 
 
@@ -422,11 +412,9 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
             item_bytes = 1
         if variable.size * item_bytes > most_bytes:
             raise DataError(
-                "a variable is larger than its file can hold",
+                f"a variable is larger than its file can hold: got shape {shape}, "
+                f"expected at most {most_bytes} bytes; {_repair_hint(path)}",
                 where=f"{path}, variable {name!r}",
-                expected=f"at most {most_bytes} bytes",
-                got=f"shape {shape}",
-                fix=_repair_hint(path),
             )
 
 
@@ -504,7 +492,7 @@ def _damage_errors(path: Path, variable: str | None = None) -> Iterator[None]:
     except LagbenchError as error:
         if str(path) in (error.where or ""):
             raise
-        raise damage_error(path, error.what, variable) from error
+        raise damage_error(path, error.text, variable) from error
     except Exception as error:
         raise reading_error(path, error, variable) from error
 
@@ -523,11 +511,9 @@ def reading_error(
     limits = (errno.EMFILE, errno.ENFILE)
     if isinstance(error, OSError) and error.errno in limits:
         return WorkFailedError(
-            "the system opens no more files",
+            f"the system opens no more files: {os.strerror(error.errno)}; "
+            f"{LIMIT_FIXES[error.errno]}; or open fewer data sets at a time",
             where=str(path),
-            expected="room for another open file",
-            got=os.strerror(error.errno),
-            fix=f"{LIMIT_FIXES[error.errno]}; or open fewer data sets at a time",
         )
     got = f"{type(error).__name__}: {error}"
     return damage_error(path, got, variable, fix=fix)
@@ -547,29 +533,19 @@ def damage_error(
         where = f"{path}, variable {variable!r}"
     if not os.access(path, os.R_OK):
         return DataError(
-            "a scenario file may not be read",
+            "a scenario file may not be read: permission denied; see who owns it: ls "
+            "-l; chmod +r lets others read it",
             where=where,
-            expected="permission to read it",
-            got="permission denied",
-            fix="see who owns it: ls -l; chmod +r lets others read it",
         )
     return DataError(
-        "a scenario file is damaged or not one of lagbench",
+        f"a scenario file is damaged or not one of lagbench: {got}; "
+        f"{fix or _repair_hint(path)}",
         where=where,
-        expected="a file that lagbench writes",
-        got=got,
-        fix=fix or _repair_hint(path),
     )
 
 
 def _missing_error(path: Path, fix: str) -> DataError:
-    return DataError(
-        "a scenario file is missing",
-        where=str(path),
-        expected="a readable file",
-        got="nothing",
-        fix=fix,
-    )
+    return DataError(f"a scenario file is missing; {fix}", where=str(path))
 
 
 def require_known_material(material: NDArray[Any], *, where: str, fix: str) -> None:
@@ -586,11 +562,9 @@ def require_known_material(material: NDArray[Any], *, where: str, fix: str) -> N
     is_known = np.isin(material, range(len(MATERIALS)))
     if not is_known.all():
         raise DataError(
-            "a particle has an unknown material",
+            f"a particle has an unknown material: got {material[~is_known][0]}, "
+            f"expected whole numbers from 0 to {len(MATERIALS) - 1}; {fix}",
             where=f"{where}, variable 'material'",
-            expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
-            got=material[~is_known][0],
-            fix=fix,
         )
 
 

@@ -127,9 +127,7 @@ def file_statistics(
 ) -> dict[str, tuple[float, ...]]:
     """Return the statistics of scenario files, read one frame at a time."""
     if not paths:
-        raise DataError(
-            "no scenario files", expected="at least one file for statistics"
-        )
+        raise DataError("no scenario files: expected at least one file for statistics")
     return statistics([file_moments(path, box=box) for path in paths])
 
 

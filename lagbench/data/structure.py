@@ -492,10 +492,7 @@ def _refusal(path: Path, name: str, issue: StorageIssue) -> UnreadableFileError:
     if name:
         where = f"{path}, {name!a}"
     return UnreadableFileError(
-        issue.what,
+        f"{issue.what}: {issue.got}; write it again without links, filters of its own, "
+        "and arrays larger than their values",
         where=where,
-        expected=issue.expected,
-        got=issue.got,
-        fix="write it again without links, filters of its own, and arrays larger than "
-        "their values",
     )

@@ -125,10 +125,9 @@ class ScenarioWriter:
         most_particles = MAX_VALUES_PER_FRAME // dimension
         if particles > most_particles:
             raise DataError(
-                "too many particles",
+                f"too many particles: got {particles}, expected at most "
+                f"{most_particles}",
                 where=str(path),
-                expected=f"at most {most_particles}",
-                got=particles,
             )
         self.path = path
         self.key = key
@@ -254,19 +253,17 @@ class ScenarioWriter:
             arrays["velocity"] = velocity
         if len(arrays) != len(self._moving_names):
             raise DataError(
-                "velocities come with every frame or with none",
+                "velocities come with every frame or with none: got "
+                f"{', '.join(arrays)}, expected {', '.join(self._moving_names)}",
                 where=str(self.path),
-                expected=", ".join(self._moving_names),
-                got=", ".join(arrays),
             )
         shape = (self._lengths["particle"], self._lengths["space"])
         for name, values in arrays.items():
             if values.shape != shape:
                 raise DataError(
-                    "a frame has the wrong shape",
+                    f"a frame has the wrong shape: got {values.shape}, expected "
+                    f"{shape}",
                     where=f"{self.path}, variable {name!r}",
-                    expected=shape,
-                    got=values.shape,
                 )
             self._hasher.update(name, values)
             with _write_errors(self.path):
@@ -347,21 +344,18 @@ def _check_material(
     where = f"{path}, variable 'material'"
     if numbers.shape != (particles,):
         raise DataError(
-            "the materials have the wrong shape",
+            f"the materials have the wrong shape: got {numbers.shape}, expected "
+            f"{(particles,)}; give one number for each particle",
             where=where,
-            expected=(particles,),
-            got=numbers.shape,
-            fix="give one number for each particle",
         )
     # before the cast, which wraps
     is_known = np.isin(numbers, range(len(MATERIALS)))
     if not is_known.all():
         raise DataError(
-            "a particle has an unknown material",
+            f"a particle has an unknown material: got {numbers[~is_known][0]}, "
+            f"expected whole numbers from 0 to {len(MATERIALS) - 1}; give the numbers "
+            "of lagbench.data.MATERIALS",
             where=where,
-            expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
-            got=numbers[~is_known][0],
-            fix="give the numbers of lagbench.data.MATERIALS",
         )
     return numbers.astype(np.int8)
 
@@ -375,20 +369,17 @@ def _check_parameters(
         fault = find_name_fault(name)
         if fault is not None:
             raise DataError(
-                f"a parameter cannot be named {describe_value(name)}",
+                f"a parameter cannot be named {describe_value(name)}: got {fault}, "
+                f"expected {POSSIBLE_NAME}; rename the parameter",
                 where=str(path),
-                expected=POSSIBLE_NAME,
-                got=fault,
-                fix="rename the parameter",
             )
         plain_value = as_attribute(value)
         if plain_value is None:
             raise DataError(
-                f"the parameter {name!r} cannot be stored",
+                f"the parameter {name!r} cannot be stored: got "
+                f"{describe_value(value)}, expected {STORABLE_VALUE}; give such a "
+                "value, or leave the parameter out",
                 where=str(path),
-                expected=STORABLE_VALUE,
-                got=describe_value(value),
-                fix="give such a value, or leave the parameter out",
             )
         plain_values[name] = plain_value
     return plain_values
@@ -406,11 +397,8 @@ def _write_errors(path: Path) -> Iterator[None]:
         if path.parent.is_dir():
             free_bytes = shutil.disk_usage(path.parent).free
         raise WorkFailedError(
-            "cannot write a scenario file",
-            where=str(path),
-            expected="a place that can be written to",
-            got=f"{error}; {free_bytes:,} bytes free",
-            # HDF5 does not say which of these it was
-            fix="free disk space, or name a folder that you may write to: --root or "
+            f"cannot write a scenario file: {error}; {free_bytes:,} bytes free; free "
+            "disk space, or name a folder that you may write to: --root or "
             f"LAGBENCH_ROOT; if there is space, {LIMIT_FIXES[errno.EFBIG]}",
+            where=str(path),
         ) from error

@@ -130,20 +130,16 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
         return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
         raise UnreadableFileError(
-            "cannot read the YAML file",
+            f"cannot read the YAML file: {error.strerror or error}; check the path "
+            "and that you may read the file",
             where=str(path),
-            expected="a file that can be read",
-            got=error.strerror or error,
-            fix="check the path and that you may read the file",
         ) from error
     # PyYAML raises other types too, as for impossible dates.
     except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:
         raise UnreadableFileError(
-            "not a plain YAML file",
+            f"not a plain YAML file: {' '.join(str(error).split())}; use plain "
+            "mappings, lists, numbers and strings, in UTF-8",
             where=str(path),
-            expected="YAML of mappings, lists, numbers and texts",
-            got=" ".join(str(error).split()),
-            fix="use plain mappings, lists, numbers and strings, in UTF-8",
         ) from error
 
 

@@ -97,11 +97,9 @@ def clean(
 def _local_split_error(size: Size, home: Path) -> UsageError:
     names = f"--split {size.split} --size {size.name} --root {quote_root(home)}"
     return UsageError(
-        "lagbench cannot make these data again",
+        "lagbench cannot make these data again: a local split, made by import; "
+        f"lagbench clean {names} --force",
         where=str(size.folder(home)),
-        expected="a data set that lagbench generates, or --force",
-        got="a local split, made by import",
-        fix=f"lagbench clean {names} --force",
     )
 
 
@@ -135,11 +133,9 @@ def _remove_files(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
         except OSError as error:
             raise WorkFailedError(
-                "cannot remove a file",
+                f"cannot remove a file: {error.strerror}; see who owns the file and "
+                "its folder: ls -l",
                 where=str(path),
-                expected="a file that you may remove",
-                got=error.strerror,
-                fix="see who owns the file and its folder: ls -l",
             ) from error
 
 

@@ -223,11 +223,9 @@ def _find_device(name: str) -> Device:
     names = list(map(str, Device))
     if name not in names:
         raise UsageError(
-            f"no device {name!r}",
+            f"no device {name!r}: expected {', '.join(names)}; "
+            f"{suggest_name(name, names)}",
             where="--device",
-            expected=", ".join(names),
-            got=ascii(name),
-            fix=suggest_name(name, names),
         )
     return Device(name)
 

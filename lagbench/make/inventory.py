@@ -210,12 +210,7 @@ def inspect_scenario(
             root, size, scenario, manifest=manifest, quick=quick, trusting=trusting
         )
     except DataError as error:
-        # How to mend it depends on the split, and is said once for all files.
-        problem = str(
-            DataError(
-                error.what, where=error.where, expected=error.expected, got=error.got
-            )
-        )
+        problem = str(error)
     except OSError as error:
         problem = f"cannot read {path}: {error.strerror}"
     return ScenarioInspection(
@@ -263,9 +258,9 @@ def _inspect_file(
         noted_content = _find_recorded_content(path, size, scenario)
         if noted_content is None:
             raise DataError(
-                "a file was simulated with other parameters",
+                "a file was simulated with other parameters: expected those of "
+                f"{size.record_name}, and of {size.generator}",
                 where=f"{path}, attributes {', '.join(different_parameters)}",
-                expected=f"those of {size.record_name}, and of {size.generator}",
             )
     content = noted_content or check_scenario(path)
 
@@ -320,10 +315,9 @@ def _check_content(
     )
     if not is_tolerated:
         raise DataError(
-            "the file has another content hash",
+            f"the file has another content hash: got {content}, expected {expected} "
+            f"of {source}",
             where=str(path),
-            expected=f"{expected} of {source}",
-            got=content,
         )
     return True
 
@@ -384,10 +378,8 @@ def _check_key(path: Path, header: ScenarioHeader, size: Size, scenario: int) ->
     expected_key = (size.split, size.name, size.major, scenario, subset)
     if stated_key != expected_key:
         raise DataError(
-            "a file holds another scenario",
+            f"a file holds another scenario: got {stated_key}, expected {expected_key}",
             where=str(path),
-            expected=expected_key,
-            got=stated_key,
         )
 
 
@@ -513,11 +505,8 @@ def _hash_error(size: Size, what: str, place: str) -> DataError:
             f"`python -m lagbench.generators.record` (docs/extending.md); else {fix}"
         )
     return DataError(
-        what,
+        f"{what}: got other hashes, expected the hashes in {size.record_name}; {fix}",
         where=f"{size.split} {size.name}, {place}",
-        expected=f"the hashes in {size.record_name}",
-        got="other hashes",
-        fix=fix,
     )
 
 

@@ -62,11 +62,10 @@ def select(
         # Without any id the message reads "no scenario at all in test".
         missing = format_ids(unknown) or "at all"
         raise UsageError(
-            f"no scenario {missing} in {', '.join(names)}",
+            f"no scenario {missing} in {', '.join(names)}: got "
+            f"{format_ids(ids) or 'none'}, expected {'; '.join(choices)}; name ids of "
+            "these, or leave --scenarios out to take all",
             where=f"--scenarios, {size.split} {size.name}",
-            expected="; ".join(choices),
-            got=format_ids(ids) or "none",
-            fix="name ids of these, or leave --scenarios out to take all",
         )
     return tuple(sorted(set(ids)))
 
@@ -79,20 +78,17 @@ def _subset_names(size: Size, subset: Selection) -> tuple[str, ...]:
         names = tuple(subset)
     if not names:
         raise UsageError(
-            "no subset is named",
+            "no subset is named: got an empty list, expected "
+            f"{', '.join(size.subsets)}; name one of these, or leave it out to take "
+            "all",
             where="--subset",
-            expected=", ".join(size.subsets),
-            got="an empty list",
-            fix="name one of these, or leave it out to take all",
         )
     for name in names:
         if name not in size.subsets:
             raise UsageError(
-                f"{size.split} {size.name} has no subset {name!r}",
+                f"{size.split} {size.name} has no subset {name!r}: expected "
+                f"{', '.join(size.subsets)}; {suggest_name(name, size.subsets)}",
                 where="--subset",
-                expected=", ".join(size.subsets),
-                got=ascii(name),
-                fix=suggest_name(name, size.subsets),
             )
     return names
 
@@ -106,28 +102,21 @@ def _scenario_ids(scenarios: str | Iterable[int]) -> tuple[int, ...]:
         ids = tuple(map(operator.index, first_numbers))
     except TypeError:
         raise UsageError(
-            "no ids",
+            f"no ids: {repr(scenarios)[:80]}; give a text, or whole numbers in a list",
             where="--scenarios",
-            expected="ids, as in (0, 3) or '0,3-5'",
-            got=repr(scenarios)[:80],
-            fix="give a text, or whole numbers in a list",
         ) from None
     if len(ids) > MAX_ID + 1:
         raise UsageError(
-            "more ids than scenarios can have",
+            f"more ids than scenarios can have: got {repr(scenarios)[:80]}, expected "
+            f"at most {MAX_ID + 1} ids, from 0 to {MAX_ID}; name fewer",
             where="--scenarios",
-            expected=f"at most {MAX_ID + 1} ids, from 0 to {MAX_ID}",
-            got=repr(scenarios)[:80],
-            fix="name fewer",
         )
     for scenario in ids:
         if abs(scenario) > MAX_ID:
             raise UsageError(
-                "a number is too large for an id",
+                f"a number is too large for an id: got {describe_value(scenario)}, "
+                f"expected ids from 0 to {MAX_ID}; name ids that `lagbench info` lists",
                 where="--scenarios",
-                expected=f"ids from 0 to {MAX_ID}",
-                got=describe_value(scenario),
-                fix="name ids that `lagbench info` lists",
             )
     return ids
 
@@ -163,11 +152,9 @@ def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
     """
     if not size.simulated:
         raise UsageError(
-            "a local split cannot be simulated",
+            "a local split cannot be simulated: a split that was adopted or imported; "
+            "lagbench import makes it again from the data that it came from",
             where=f"{size.split} {size.name}",
-            expected="a split that a generator makes",
-            got="a split that was adopted or imported",
-            fix="lagbench import makes it again from the data that it came from",
         )
     solver_constants(size)  # refuses parameters that the solver cannot use
 
@@ -214,11 +201,9 @@ def free_bytes(folder: Path) -> int:
     elif existing.is_symlink():
         obstacle = "a link that leads to no folder"
     raise WorkFailedError(
-        "no data set can be written here",
+        f"no data set can be written here: {existing} is {obstacle}; name another "
+        "folder: --root or LAGBENCH_ROOT",
         where=str(folder),
-        expected="a folder that you may write to",
-        got=f"{existing} is {obstacle}",
-        fix="name another folder: --root or LAGBENCH_ROOT",
     )
 
 
@@ -235,10 +220,8 @@ def check_disk(root: Path, needed: int) -> None:
     free = free_bytes(root)
     if free < needed:
         raise WorkFailedError(
-            "not enough disk space",
+            f"not enough disk space: got {free} bytes free, expected {needed} bytes "
+            "free; free disk space, name another folder with --root, or fewer "
+            "scenarios with --scenarios",
             where=str(root),
-            expected=f"{needed} bytes free",
-            got=f"{free} bytes free",
-            fix="free disk space, name another folder with --root, or fewer scenarios "
-            "with --scenarios",
         )

@@ -93,26 +93,14 @@ class VerificationResult:
         """Raise a DataError unless everything that has to hold does."""
         where = str(self.folder)
         if self.problems:
-            count = f"{len(self.problems)} problems"
-            if len(self.problems) == 1:
-                count = "1 problem"
-            what = "\n  ".join([count, *self.problems])
+            problems = "\n  ".join(self.problems)
             raise DataError(
-                what,
+                f"{len(self.problems)} problem(s):\n  {problems}\n{self.fix}",
                 where=where,
-                expected="files and hashes as they are recorded",
-                got=self.problems[0],
-                fix=self.fix,
             )
 
         if not any(report.present for report in self.subsets):
-            raise DataError(
-                "nothing is generated",
-                where=where,
-                expected="scenario files",
-                got="none",
-                fix=self.fix,
-            )
+            raise DataError(f"nothing is generated; {self.fix}", where=where)
 
         if self.must_be_complete and not self.complete:
             gaps = []
@@ -120,11 +108,8 @@ class VerificationResult:
                 if report.missing:
                     gaps.append(f"{report.name} {format_ids(report.missing)}")
             raise DataError(
-                "the data set is incomplete",
+                f"the data set is incomplete, missing: {', '.join(gaps)}; {self.fix}",
                 where=where,
-                expected="all scenarios",
-                got=f"missing: {', '.join(gaps)}",
-                fix=self.fix,
             )
 
 
@@ -171,11 +156,9 @@ def verify(
     cores = worker_count(workers)
     if regenerate < 0:
         raise UsageError(
-            "the number is negative",
+            f"the number is negative: {regenerate}; leave it out, or give such a "
+            "number",
             where="--regenerate",
-            expected=">= 0",
-            got=regenerate,
-            fix="leave it out, or give such a number",
         )
     if regenerate:
         check_installed("taichi", extra="generate")

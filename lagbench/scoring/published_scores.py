@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from lagbench.data.field_errors import describe_expectation, is_own_sentence
+from lagbench.data.field_errors import describe_faults
 from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.aggregate import LARGEST, Score
 from lagbench.metrics.metric import Metric
@@ -119,12 +119,7 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
     try:
         checked = _ScoresContent.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = "/".join(map(str, first["loc"]))
-        message = describe_expectation(first)
-        if not is_own_sentence(first):
-            message = f"expected {message}"
-        raise ValueError(f"{place!a}: {message}") from error
+        raise ValueError(describe_faults(error)) from error
 
     metrics = available()
     rows = {}

@@ -74,11 +74,9 @@ class FolderMark:
             if folder.is_dir():
                 got = "another folder"
             raise WorkFailedError(
-                "a worker does not see the folder of the data set",
+                f"a worker does not see the folder of the data set: {got}; name a "
+                "folder on storage that all of them share: --root",
                 where=f"{folder}, worker {worker}",
-                expected="one folder under the same path on every worker and here",
-                got=got,
-                fix="name a folder on storage that all of them share: --root",
             )
         check_writable(folder)
         for path in folder.iterdir():
@@ -105,12 +103,10 @@ def await_file(path: Path) -> None:
     """Wait until a file that another machine has written is seen here."""
     if not _wait_for_file(path, PATIENCE):
         raise WorkFailedError(
-            "a worker's file does not appear",
+            "a worker's file does not appear: got no file, expected a file within "
+            f"{PATIENCE:.0f} s; name a folder on storage that all machines share, "
+            "then run the same command again",
             where=str(path),
-            expected=f"a file within {PATIENCE:.0f} s",
-            got="no file",
-            fix="name a folder on storage that all machines share, then run the same "
-            "command again",
         )
 
 
@@ -164,19 +160,15 @@ class Client:
         worker_version = version("lagbench")
         if self.version != worker_version:
             raise WorkFailedError(
-                "a worker runs another version of lagbench",
+                f"a worker runs another version of lagbench: got {worker_version}, "
+                f"expected {self.version}; install the same version on every worker",
                 where=where,
-                expected=self.version,
-                got=worker_version,
-                fix="install the same version on every worker",
             )
         if threads != 1:
             raise WorkFailedError(
-                "a worker runs several items in one process",
+                f"a worker runs several items in one process: {threads} threads; "
+                f"start the workers with `{WORKERS}`",
                 where=where,
-                expected="1 thread",
-                got=f"{threads} threads",
-                fix=f"start the workers with `{WORKERS}`",
             )
         if self.mark is not None:
             self.mark.check(worker)
@@ -416,11 +408,9 @@ def _lost_error(reason: object) -> WorkFailedError:
     if isinstance(reason, Exception):
         reason = f"{type(reason).__name__}: {reason}"
     return WorkFailedError(
-        "the Dask cluster is lost",
+        f"the Dask cluster is lost: {reason}; start scheduler and workers, then run "
+        "the same command again",
         where="--scheduler",
-        expected="a scheduler and workers that answer",
-        got=reason,
-        fix="start scheduler and workers, then run the same command again",
     )
 
 
@@ -437,21 +427,17 @@ def _fetch_result(name: str, future: Any) -> ItemResult | None:  # noqa: ANN401
         raise
     except killed_worker_error as error:
         raise WorkFailedError(
-            "workers of the Dask cluster died again and again",
+            f"workers of the Dask cluster died again and again: {error}; give the "
+            "workers more memory, or leave --scheduler out",
             where=name,
-            expected="workers that live as long as the work",
-            got=str(error),
-            fix="give the workers more memory, or leave --scheduler out",
         ) from error
     except Exception as error:  # a worker that cannot read the item raises anything
         if future.status == "error":
             raise WorkFailedError(
-                "a worker of the Dask cluster cannot do the work",
+                "a worker of the Dask cluster cannot do the work: "
+                f"{type(error).__name__}: {error}; install the same version of "
+                "lagbench with its extras on every worker",
                 where=name,
-                expected="a worker with the same packages",
-                got=f"{type(error).__name__}: {error}",
-                fix="install the same version of lagbench with its extras on every "
-                "worker",
             ) from error
         if isinstance(error, TimeoutError):
             return None

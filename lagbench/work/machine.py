@@ -157,11 +157,9 @@ def worker_count(workers: int | None, *, default: int | None = None) -> int:
         if count < 1:
             what = "at least one worker is needed"
     raise UsageError(
-        what,
+        f"{what}: {repr(workers)[:80]}; leave it out: a number that suits the work is "
+        "taken",
         where="--workers",
-        expected="a whole number from 1",
-        got=repr(workers)[:80],
-        fix="leave it out: a number that suits the work is taken",
     )
 
 
@@ -313,22 +311,18 @@ class LimitedChild:
         is_memory = code == OUT_OF_MEMORY or any(word in text for word in MEMORY_SIGNS)
         if limit is not None and limit < self._memory and is_memory:
             return WorkFailedError(
-                "there is not enough memory",
+                f"there is not enough memory: got a limit of {limit >> 20} MiB, "
+                f"expected {self._memory >> 20} MiB for a child process; raise the "
+                "limit (`ulimit -v unlimited`, or that of the batch system)",
                 where=self._arguments[0],
-                expected=f"{self._memory >> 20} MiB for a child process",
-                got=f"a limit of {limit >> 20} MiB",
-                fix="raise the limit (`ulimit -v unlimited`, or that of the batch "
-                "system)",
             )
         if b"Traceback" in text and code > 0 and code != OUT_OF_MEMORY:
             lines = text.decode("utf-8", "replace").strip().rsplit("\n", 1)
             return WorkFailedError(
-                "a child process itself failed",
+                f"a child process itself failed: {lines[-1][:300]!a}; `lagbench "
+                "doctor` checks the installation; if it finds nothing, report this "
+                "with the file",
                 where=self._arguments[0],
-                expected="an answer of the child process",
-                got=ascii(lines[-1][:300]),
-                fix="`lagbench doctor` checks the installation; if it finds nothing, "
-                "report this with the file",
             )
         return ChildStopped(describe_exit(code, self._memory))
 
@@ -363,11 +357,9 @@ class Answers(NamedTuple):
         """
         if self.is_late and LIMITS:
             raise WorkFailedError(
-                "the machine is too busy",
+                f"the machine is too busy: {self.stopped}; call again when the "
+                "machine is idle",
                 where=where,
-                expected="an answer of a child process",
-                got=self.stopped,
-                fix="call again when the machine is idle",
             )
 
 

@@ -117,11 +117,8 @@ class Pool:
         """Refuse a pool in which no item could ever run."""
         if not AVAILABLE:
             raise WorkFailedError(
-                "this system cannot start workers",
+                "this system cannot start workers: none of them; on Windows use WSL",
                 where=sys.platform,
-                expected="a system with fork and pipes, as Linux or macOS",
-                got="none of them",
-                fix="on Windows use WSL",
             )
         self.size = worker_count(self.size)
 
@@ -257,11 +254,9 @@ class Pool:
             if code < 0:
                 cause = f"killed by {signal.Signals(-code).name}"
             raise WorkFailedError(
-                f"a worker process died {ATTEMPTS} times",
+                f"a worker process died {ATTEMPTS} times: {cause}; "
+                f"{_advise_on_death(code)}",
                 where=attempt.item.name,
-                expected="a worker that lives as long as the work",
-                got=cause,
-                fix=_advise_on_death(code),
             )
         self._enqueue(next_attempt)
         return Event(item=attempt.item, kind="lost", value=worker.progress)
@@ -304,13 +299,11 @@ def error_to_send(error: Exception) -> LagbenchError:
         return error
     if isinstance(error, MemoryError):
         return WorkFailedError(
-            "there is not enough memory",
+            f"there is not enough memory: {type(error).__name__}: {str(error)[:200]}; "
+            "free memory, or raise the limit (`ulimit -v unlimited`, or that of the "
+            "batch system); where the command has the option --workers, take fewer of "
+            "them",
             where="a worker process",
-            expected="room for the libraries and the data",
-            got=f"{type(error).__name__}: {str(error)[:200]}",
-            fix="free memory, or raise the limit (`ulimit -v unlimited`, or that of "
-            "the batch system); where the command has the option --workers, take "
-            "fewer of them",
         )
     if isinstance(error, OSError) and find_place_in_extension(error) is None:
         explained = explain_system_error(error)
@@ -325,19 +318,15 @@ def crash_error(error: Exception) -> WorkFailedError:
     if place is not None:
         messages = [repr(error), *getattr(error, "__notes__", ())]
         return WorkFailedError(
-            "a package failed in a worker",
+            f"a package failed in a worker: {', '.join(messages)}; mend or uninstall "
+            "that package",
             where=place,
-            expected="a result",
-            got=", ".join(messages),
-            fix="mend or uninstall that package",
         )
     trace = "".join(traceback.format_exception(error, limit=-6))
     return WorkFailedError(
-        "a worker crashed",
+        f"a worker crashed: {error!r}\n{trace}; this is a fault of lagbench: report "
+        "it with this message",
         where="a worker process",
-        expected="a result",
-        got=f"{error!r}\n{trace}",
-        fix="this is a fault of lagbench: report it with this message",
     )
 
 

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.errors import UsageError
 
 Floats = NDArray[np.floating[Any]]
 
@@ -148,26 +147,6 @@ def test_walls_are_named_by_the_axes_that_have_them() -> None:
     cube = Box.from_bounds([(0.0, 1.0)] * 3)
     assert cube.walls == ("left", "right", "bottom", "top", "front", "back")
     assert SOLID.volume == pytest.approx(1.0)
-
-
-UNIT = (0.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("bounds", "periodic"),
-    [
-        ([UNIT], None),
-        ([UNIT, UNIT, UNIT, UNIT], None),
-        ([UNIT, (1.0, 1.0)], None),
-        ([UNIT, (0.0, float("nan"))], None),
-        ([UNIT, UNIT], [True]),
-    ],
-)
-def test_what_is_no_box_is_refused(
-    bounds: list[tuple[float, float]], periodic: list[bool] | None
-) -> None:
-    with pytest.raises(UsageError):
-        Box.from_bounds(bounds, periodic)
 
 
 def test_a_point_just_below_the_upper_end_stands_in_a_tree() -> None:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
 from lagbench.data.grid import Fields, Grid, Placement
-from lagbench.errors import UsageError
 
 Floats = NDArray[np.float64]
 Flow = Callable[[Floats, Floats], tuple[Floats, Floats]]
@@ -357,25 +356,3 @@ def test_particles_outside_the_box_carry_no_weight(value: float) -> None:
     expected = gridding.transfer(x, u, grid)
     assert_array_equal(sums.weight, expected.weight)
     assert_array_equal(sums.momentum, expected.momentum)
-
-
-@pytest.mark.parametrize(
-    ("x", "u"),
-    [
-        ((5, 2), (4, 2)),
-        ((5, 3), (5, 3)),
-        ((2,), (2,)),
-    ],
-)
-def test_wrong_shapes_are_named(x: tuple[int, ...], u: tuple[int, ...]) -> None:
-    """Arrays that do not fit are refused with both shapes; so is a single cell."""
-    position = np.zeros(x)
-    velocity = np.zeros(u)
-    with pytest.raises(UsageError) as caught:
-        gridding.transfer(position, velocity, Grid(4))
-    assert str(x) in str(caught.value)
-    with pytest.raises(UsageError):
-        Grid(1)
-    no_particles = np.empty((0, 2))
-    sums = gridding.transfer(no_particles, no_particles, Grid(4))
-    assert not sums.weight.any()

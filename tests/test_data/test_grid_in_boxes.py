@@ -20,7 +20,6 @@ from lagbench.data.grid import (
     transfer,
     vorticity,
 )
-from lagbench.errors import UsageError
 
 Floats = NDArray[np.float64]
 
@@ -266,9 +265,3 @@ def test_fields_of_a_batch_are_those_of_its_frames() -> None:
         single = fields(position, velocity, grid, full=full)
         assert_array_equal(batch.vorticity[frame], single.vorticity)
         assert_array_equal(batch.divergence[frame], single.divergence)
-
-
-def test_a_period_is_a_whole_number_of_cells() -> None:
-    with pytest.raises(UsageError) as caught:
-        Grid(5, Placement.CELL_CENTRES, SOLID_CHANNEL)
-    assert caught.value.where == "cells"

@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 import pytest
 
-from lagbench.data.hdf5 import check_file, open_hdf5
+from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.structure import Structure, check_structure
-from lagbench.errors import UnreadableFileError, check_regular
+from lagbench.errors import UnreadableFileError
 
 ANY = Structure(groups=None)
 
@@ -232,33 +232,3 @@ def test_large_honest_chunks_pass(tmp_path: Path) -> None:
 
     path = write_file(tmp_path / "a.h5", fill)
     assert list_arrays(path) == {"plain", "x"}
-
-
-def test_files_that_are_too_long_are_refused(tmp_path: Path) -> None:
-    """One byte is enough."""
-    path = tmp_path / "a"
-    path.write_bytes(bytes(100))
-    assert check_regular(path, longest=100) == 100
-    with pytest.raises(UnreadableFileError):
-        check_regular(path, longest=99)
-
-
-@pytest.mark.parametrize(
-    ("content", "got"),
-    [
-        (b"CDF\x02", "netCDF-3, the old format"),
-        (b"CDF is a format", "a text file"),
-        (("a" + "Ü" * 40).encode(), "a text file"),
-        (b"\xff\xfe\x00", "bytes of another format"),
-        (b"", "an empty file"),
-    ],
-)
-def test_a_file_of_another_format_is_named(
-    tmp_path: Path, content: bytes, got: str
-) -> None:
-    """A text in UTF-8 is a text, even where the first bytes end inside a character."""
-    path = tmp_path / "a.nc"
-    path.write_bytes(content)
-    with pytest.raises(UnreadableFileError) as caught:
-        check_file(path)
-    assert caught.value.got == got

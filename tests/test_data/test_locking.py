@@ -111,39 +111,3 @@ def test_whatever_ends_the_block_frees_the_lock(tmp_path: Path) -> None:
     ):
         pass
     assert caught.value.where.endswith("fluid/tiny/v1")
-    assert "--root" in caught.value.fix
-
-
-def test_a_damaged_holder_file_is_no_obstacle(tmp_path: Path) -> None:
-    """The holder file is information only: rubbish in it reads as nobody."""
-    folder = dataset_folder(tmp_path, "cavity", "tiny", 1)
-    folder.mkdir(parents=True)
-    for text in (
-        "",
-        "[1]",
-        '{"pid": 1}',
-        '{"pid": 1, "host": "a", "since": "b", "more": 2}',
-        "\x00",
-        "[" * 100_000,
-    ):
-        (folder / ".lock.holder.json").write_text(text)
-        assert read_holder(folder) is None
-    with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
-        pass
-
-
-@pytest.mark.parametrize("name", [".lock", ".lock.holder.json"])
-def test_a_folder_in_the_place_of_a_lock_file_is_named(
-    name: str, tmp_path: Path
-) -> None:
-    folder = dataset_folder(tmp_path, "cavity", "tiny", 1)
-    (folder / name).mkdir(parents=True)
-    with (
-        pytest.raises(WorkFailedError) as caught,
-        dataset_lock(tmp_path, "cavity", "tiny", 1),
-    ):
-        pass
-    assert name in str(caught.value.where)
-    (folder / name).rmdir()
-    with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
-        pass

@@ -9,8 +9,6 @@ import functools
 import math
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import EntryPoint
@@ -20,13 +18,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 
 from lagbench.baselines.augmentation import check_symmetry
 from lagbench.data import registry
 from lagbench.data.box import Box
-from lagbench.data.limits import NEEDED, SUBSETS, Limit, check_frames, check_parameters
+from lagbench.data.limits import NEEDED, SUBSETS, check_parameters
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.yamlfile import read_yaml
@@ -232,25 +228,6 @@ tiny = partial(within, "fluid", "sizes", "tiny", "parameters")
 always = partial(within, "fluid", "parameters")  # what fluid declares for all sizes
 
 
-def test_unknown_names_offer_the_nearest() -> None:
-    """Split, size, parameter and scenario, each with what is known."""
-    with pytest.raises(UsageError) as caught:
-        load().size("multimatrial", "full")
-    assert caught.value.where == "SPLIT or --split"
-    with pytest.raises(UsageError) as caught:
-        load().size("fluid", "ful")
-    assert caught.value.where == "--size"
-    assert caught.value.expected == "full or mini or tiny"
-    fluid = load().size("fluid", "full")
-    with pytest.raises(UsageError) as caught:
-        fluid.value("liqid_modulus")
-    assert caught.value.where == "datasets.yaml, fluid full"
-    multimaterial = load().size("multimaterial", "full")
-    with pytest.raises(UsageError) as caught:
-        multimaterial.subset_of(95)
-    assert caught.value.where == "multimaterial full"
-
-
 def test_a_box_has_walls_unless_axes_are_periodic(tmp_path: Path) -> None:
     walled = load().size("cavity", "full")
     assert walled.box.walls == ("left", "right", "bottom", "top")
@@ -266,8 +243,6 @@ def test_a_registry_of_ones_own(
 ) -> None:
     """LAGBENCH_REGISTRY replaces ours; a change of the file is seen in the same
     process.
-
-    YAML reads hexadecimals of any length, which Python does not print.
     """
     ours = set(load(default_path()).splits)
     path = edited(tmp_path, lambda splits: splits.pop("fluid"))
@@ -282,8 +257,6 @@ def test_a_registry_of_ones_own(
     with pytest.raises(UnreadableFileError) as caught:
         load()
     assert caught.value.where.endswith("none.yaml")
-    path.write_text(f"format: 0x{'f' * 5000}")
-    refused(path, ("format",), lambda: load(path))
 
 
 def test_a_path_that_means_another_file_is_read_anew(
@@ -326,13 +299,11 @@ Parts = tuple[str, ...]
 
 
 def refused(path: Path, parts: Parts, call: Callable[[], object]) -> None:
-    """Assert that a call names file and parts, exit code 3."""
+    """Assert that a call names file and key."""
     with pytest.raises(UnreadableFileError) as caught:
         call()
-    text = str(caught.value)
-    assert caught.value.exit_code == 3
-    for part in (str(path), *parts):
-        assert part in text
+    assert str(caught.value.where).startswith(str(path))
+    assert parts[0] in str(caught.value)
 
 
 def lead_out(splits: dict[str, Any]) -> None:
@@ -520,22 +491,6 @@ def test_a_rate_of_zero_stands_for_no_fringe(
     check_symmetry("square", size, find_forcing=tuple)
 
 
-@pytest.mark.parametrize(
-    ("length", "parts"),
-    [
-        (None, ("parameter fringe_length", "declare fringe_length")),
-        (0.0, ("parameter fringe_length", "a finite number, > 0", "0.0")),
-        (1.5, ("parameter fringe_length", "<= 1", "1.5")),
-    ],
-)
-def test_a_fringe_with_a_rate_needs_a_length(
-    tmp_path: Path, length: float | None, parts: tuple[str, ...]
-) -> None:
-    path = edited(tmp_path, with_fringe(length, 20.0))
-    size = load(path).size("poiseuille", "tiny")
-    refused(path, parts, partial(solver_constants, size))
-
-
 UNUSABLE = always("area_min", value="big")
 UNUSABLE_PARTS = ("size tiny", "generators.fluid can use", "area_min = 'big'")
 
@@ -559,22 +514,6 @@ def test_a_scenario_that_cannot_be_drawn_is_refused(
     refused(path, parts, draw)
 
 
-def test_a_worker_refuses_a_scenario_that_cannot_be_drawn(tmp_path: Path) -> None:
-    """Planning draws nothing, so a dry run passes; no file is left."""
-    path = edited(tmp_path, UNUSABLE)
-    root = tmp_path / "data"
-    options: dict[str, Any] = {
-        "root": root,
-        "registry": load(path),
-        "workers": 1,
-    }
-    generate("fluid", "tiny", dry_run=True, **options)
-    simulate = partial(generate, "fluid", "tiny", **options)
-    refused(path, UNUSABLE_PARTS, simulate)
-    assert not list(root.rglob("*.nc"))
-    assert not list(root.rglob("manifest.json"))
-
-
 def test_our_own_values_hold_with_room() -> None:
     """Every number of ours lies within its limit, at every size, or the limits are
     wrong.
@@ -588,21 +527,6 @@ def test_our_own_values_hold_with_room() -> None:
                 if parameter in size.parameters:
                     value = size.value(parameter)
                     assert limit.holds(value), (split, name, parameter)
-
-
-@given(st.one_of(st.integers(), st.floats(), st.booleans(), st.text()))
-def test_limits_agree_with_their_words(value: Any) -> None:
-    """An integer from -2 to 5, exclusive of 5, is what `holds` says, whatever the
-    type.
-    """
-    is_integer = type(value) is int
-    is_number = type(value) in (int, float)
-    whole = Limit(low=-2, high=5, whole=True, open_high=True)
-    assert whole.holds(value) == (is_integer and -2 <= value < 5)
-    real = Limit(low=0.0, open_low=True)
-    assert real.holds(value) == (is_number and 0 < value < math.inf)
-    assert str(whole) == "an integer, >= -2 and < 5"
-    assert str(real) == "a finite number, > 0"
 
 
 Plug = Callable[..., Registry]
@@ -690,11 +614,6 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
             "import no_such_module_at_all",
             "ModuleNotFoundError.*no_such_module_at_all",
         ),
-        (
-            "mute",
-            "class Mute(Exception): __str__ = lambda self: self.missing\nraise Mute",
-            "Mute",
-        ),
         ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "/nowhere/datasets.yaml"),
         ("silent", "REGISTRY = {theirs!r}", "no split 'silent'"),
         ("cavity", "REGISTRY = {theirs!r}", "its name is taken"),
@@ -745,29 +664,6 @@ def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert registry.list_entry_points("some.group") == ()
 
 
-def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
-    """An installed package whose module is gone: the command works, one line on stderr
-    names the package.
-    """
-    install_waves(tmp_path, f"[{registry.GROUP}]\nwaves = wave_splits.gone\n")
-    code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
-        "from lagbench.__main__ import app; app()"
-    )
-    command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
-    done = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert '"split": "cavity"' in done.stdout
-    assert done.stderr.startswith("warning: package wave-splits adds no split 'waves'")
-    assert len(done.stderr.splitlines()) == 1
-
-
 @pytest.mark.parametrize(
     ("split", "expected"),
     [
@@ -806,22 +702,6 @@ def test_parameters_that_readers_compute_with_are_numbers(
     check_parameters("tiny", {**values, name: 0.5, "shape": "disc"}, declared)
     with pytest.raises(ValueError, match=name):
         check_parameters("tiny", {**values, name: value, "shape": "disc"}, declared)
-
-
-def test_an_integer_beyond_every_float_is_no_finite_number() -> None:
-    """Python compares it, but it becomes no float; the message does not print it."""
-    huge = 16**5000
-    assert not Limit().holds(huge)
-    assert not Limit().holds(-huge)
-    values = dict.fromkeys(NEEDED, 4)
-    declared = dict.fromkeys(values)
-    check_parameters("tiny", values, declared)
-    with pytest.raises(ValueError, match=r"sizes\.tiny.*grid") as caught:
-        check_parameters("tiny", values | {"grid": huge}, declared)
-    assert len(str(caught.value)) < 200
-    with pytest.raises(ValueError, match=r"sizes\.tiny\.frames") as caught:
-        check_frames("tiny", huge, {"train": (0,)}, task_frames=4)
-    assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,7 @@ leaves.
 
 from __future__ import annotations
 
-import json
 import platform
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,15 +13,12 @@ import pytest
 from conftest import SIZE, SPLIT
 from rewritten_files import forge
 
-from lagbench.data import checksums
 from lagbench.data.manifest import Manifest, read_manifest, write_manifest
 from lagbench.data.registry import Measured, Registry
 from lagbench.errors import DataError
 from lagbench.generators.record import measured_values
-from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import verify
-from lagbench.work.run import Progress
 
 Copy = Callable[[], Path]
 
@@ -186,84 +181,6 @@ def test_wrong_statistics_are_mended(
     assert manifest_of(root).statistics == right.statistics
 
 
-def test_paths_of_a_manifest_are_not_published(
-    copied: Copy, unmeasured: Registry
-) -> None:
-    """A manifest that names a file elsewhere is written anew from the files."""
-    root = copied()
-    folder = root / SPLIT / SIZE / "v2"
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text())
-    manifest["files"][3]["path"] = "../../../../../etc/passwd"
-    path.write_text(json.dumps(manifest))
-    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
-    for name in ("manifest.json", "croissant.json", "README.md"):
-        text = (folder / name).read_text()
-        assert "passwd" not in text
-
-
-def test_a_second_call_hashes_each_file_once_and_draws_nothing(
-    copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Bytes are read once, progress is reported meanwhile, and cards that would be the
-    same stay.
-    """
-    root = copied()
-    read: Counter[str] = Counter()
-    news: list[Progress] = []
-
-    def counted(path: Path) -> str:
-        read[path.name] += 1
-        return checksums.file_sha256(path)
-
-    def refuse(*_: object) -> list[str]:
-        pytest.fail("pictures are drawn again")
-
-    for module in ("make.inventory", "data.manifest"):
-        monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
-    monkeypatch.setattr(cards, "paint_pictures", refuse)
-    generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=True)
-    read.clear()
-    generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
-    each_once = {f"{scenario:04d}.nc": 1 for scenario in range(5)}
-    assert read == each_once
-    checking = [state for state in news if state.stage == "checking"]
-    first = checking[0]
-    last = checking[-1]
-    assert first.done == 0
-    assert last.done == 5
-    assert last.total == 5
-
-
-def test_values_are_hashed_once(
-    copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At the first call of a copied folder; a dry run takes the manifest's word, later
-    calls the note.
-    """
-
-    def refuse(*_: object) -> str:
-        pytest.fail("values are hashed again")
-
-    root = copied()
-    for dry_run, may_hash in (
-        (True, False),
-        (False, True),
-        (False, False),
-    ):
-        with monkeypatch.context() as patch:
-            if not may_hash:
-                patch.setattr("lagbench.make.inventory.check_scenario", refuse)
-            result = generate(
-                SPLIT,
-                SIZE,
-                root=root,
-                registry=unmeasured,
-                dry_run=dry_run,
-            )
-        assert result.kept == (0, 1, 2, 3, 4)
-
-
 @pytest.mark.parametrize("name", ["README.md", "croissant.json", "pictures/frame.png"])
 def test_a_missing_or_changed_card_is_written_again(
     name: str, copied: Copy, unmeasured: Registry
@@ -275,45 +192,3 @@ def test_a_missing_or_changed_card_is_written_again(
     path.unlink()
     generate(SPLIT, SIZE, root=root, registry=unmeasured)
     assert path.read_bytes() == before
-
-
-EDITED = """
-from dataclasses import replace
-from lagbench.generators import curl_noise
-from lagbench.generators.curl_noise import solver_parameters
-
-def initial_state(size, scenario, rng):
-    state = curl_noise.initial_state(size, scenario, rng)
-    parameters = dict(state.parameters)
-    parameters["frequency"] += 1
-    return replace(state, parameters=parameters)
-"""
-
-
-@pytest.mark.parametrize("is_recorded", [True, False])
-def test_an_edited_module_costs_no_file_with_the_recorded_hash(
-    copied: Copy,
-    unmeasured: Registry,
-    right: Measured,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    is_recorded: bool,
-) -> None:
-    """Only files without a recorded hash are simulated again: they may be any draw."""
-    modules = tmp_path / "modules"
-    modules.mkdir()
-    (modules / "edited_noise.py").write_text(EDITED)
-    monkeypatch.syspath_prepend(modules)
-    split = unmeasured.split(SPLIT).model_copy(update={"generator": "edited_noise"})
-    registry = Registry({SPLIT: split}, {})
-    if is_recorded:
-        registry = with_measured(registry, right)
-    root = copied()
-    plan = generate(SPLIT, SIZE, root=root, registry=registry, dry_run=True)
-    if not is_recorded:
-        assert plan.simulated == (0, 1, 2, 3, 4)
-        return
-    assert plan.simulated == ()
-    generate(SPLIT, SIZE, root=root, registry=registry)
-    assert manifest_of(root).dataset_sha256 == right.dataset_sha256
-    verify(SPLIT, SIZE, root=root, registry=registry).check()

@@ -5,12 +5,11 @@ trace.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -465,23 +464,6 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert set(select(size)) == everything
 
 
-@pytest.mark.parametrize("scenarios", [range(10**15), itertools.count()])
-def test_a_selection_without_end_is_refused(
-    scenarios: Iterable[int], unmeasured: Registry
-) -> None:
-    """A selection takes no more time and memory than there can be scenarios."""
-    with pytest.raises(UsageError, match="more ids than") as caught:
-        select(unmeasured.size("fluid", "full"), scenarios=scenarios)
-    assert caught.value.where == "--scenarios"
-
-
-def test_an_empty_list_of_subsets_is_not_all_of_them(unmeasured: Registry) -> None:
-    """A list that a program left empty does not start hours of work."""
-    with pytest.raises(UsageError) as caught:
-        select(unmeasured.size("fluid", "full"), subset=[])
-    assert caught.value.where == "--subset"
-
-
 @pytest.mark.slow
 def test_files_in_three_dimensions_are_estimated_without_velocities(
     unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
@@ -511,89 +493,6 @@ def test_estimates_add_up(unmeasured: Registry) -> None:
     assert expected.seconds(9) == expected.seconds(2)
 
 
-GENERATOR = """
-import os
-from dataclasses import replace
-from pathlib import Path
-from lagbench.generators import cavity
-from lagbench.generators.cavity import solver_parameters, start_frame
-
-def initial_state(size, scenario, rng):
-    with Path(os.environ["DRAWS"]).open("a") as log:
-        log.write(f"{os.getpid()} {scenario}\\n")
-    state = cavity.initial_state(size, scenario, rng)
-    parameters = dict(state.parameters)
-    del parameters["wall"]  # a constant has this name, which only our splits may hide
-    return replace(state, parameters=parameters)
-"""
-
-
-@pytest.fixture
-def draw_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The file to which the module ``counted_cavity`` writes its draws, in any
-    process.
-    """
-    modules = tmp_path / "modules"
-    modules.mkdir()
-    (modules / "counted_cavity.py").write_text(GENERATOR)
-    monkeypatch.syspath_prepend(modules)
-    log = tmp_path / "draws.txt"
-    log.touch()
-    monkeypatch.setenv("DRAWS", str(log))
-    return log
-
-
-@pytest.fixture
-def counted_registry() -> Registry:
-    """The cavity, drawn by a module that logs its draws."""
-    split = load().split("cavity").model_copy(update={"generator": "counted_cavity"})
-    return Registry({"cavity": split}, {})
-
-
-@pytest.mark.slow
-def test_each_scenario_is_drawn_once_in_the_worker_that_simulates_it(
-    tmp_path: Path, draw_log: Path, counted_registry: Registry
-) -> None:
-    """The perturbed run of test starts from the same draw; the parent draws nothing."""
-    one_of_train_and_one_of_test = (0, 3)
-    result = generate(
-        "cavity",
-        SIZE,
-        scenarios=one_of_train_and_one_of_test,
-        root=tmp_path / "data",
-        workers=1,
-        registry=counted_registry,
-    )
-    assert result.simulated == one_of_train_and_one_of_test
-    processes = set()
-    scenarios = []
-    for line in draw_log.read_text().splitlines():
-        process, scenario = line.split()
-        processes.add(process)
-        scenarios.append(int(scenario))
-    assert sorted(scenarios) == [0, 3]
-    assert len(processes) == 1
-    assert str(os.getpid()) not in processes
-
-
-def test_planning_draws_no_scenario(
-    tmp_path: Path, draw_log: Path, counted_registry: Registry
-) -> None:
-    """Estimate, dry run and the count of substeps need the first frame alone."""
-    size = counted_registry.size("cavity", SIZE)
-    counts = [substep_count(size, scenario) for scenario in size.scenarios]
-    assert estimate(size, size.scenarios).substeps == tuple(counts)
-    result = generate(
-        "cavity",
-        SIZE,
-        root=tmp_path / "data",
-        dry_run=True,
-        registry=counted_registry,
-    )
-    assert result.simulated == size.scenarios
-    assert draw_log.read_text() == ""
-
-
 @pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
 @pytest.mark.parametrize("tier", ["tiny", "mini"])
 def test_the_first_frame_is_that_of_the_whole_draw(split: str, tier: str) -> None:
@@ -601,57 +500,6 @@ def test_the_first_frame_is_that_of_the_whole_draw(split: str, tier: str) -> Non
     for scenario in size.scenarios[:8]:
         state = draw_initial_state(size, scenario)
         assert start_frame(size, scenario) == state.start_frame
-
-
-def test_a_split_that_hides_its_first_frame_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without the function for a late start, the plan would count too few frames."""
-    (tmp_path / "late_cavity.py").write_text(
-        "from lagbench.generators.cavity import initial_state, solver_parameters\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    size = load().size("cavity", SIZE)
-    late = size.model_copy(update={"generator": "late_cavity"})
-    with pytest.raises(UsageError) as caught:
-        draw_initial_state(late, 0)
-    assert caught.value.where == "late_cavity.initial_state, scenario 0"
-
-
-LOADED = """
-import sys
-from lagbench.make.generate import generate
-from lagbench.data.registry import load
-from pathlib import Path
-generate(sys.argv[1], sys.argv[2], root=sys.argv[3], registry=load(Path(sys.argv[4])))
-print(*(name for name in sys.modules if name.startswith("lagbench.figures.")))
-"""
-
-
-@pytest.mark.slow
-def test_a_generation_that_paints_nothing_loads_no_drawing_module(
-    copied: Callable[[], Path], unmeasured: Registry, unmeasured_path: Path
-) -> None:
-    """Where everything is there, the card's tables are formatted, and that is all."""
-    root = copied()
-    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
-    command = [sys.executable, "-c", LOADED, SPLIT, SIZE, root, unmeasured_path]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["lagbench.figures.tables"]
-
-
-@pytest.mark.parametrize("dry_run", [True, False])
-def test_a_root_that_is_a_file_is_refused_dry_or_not(
-    dry_run: bool, tmp_path: Path, unmeasured: Registry
-) -> None:
-    """A dry run does not promise what the real one cannot do: the same error, the same
-    exit code.
-    """
-    (tmp_path / "file").write_text("mine")
-    for root in (tmp_path / "file", tmp_path / "file" / "data"):
-        with pytest.raises(UsageError) as caught:
-            generate(SPLIT, SIZE, root=root, dry_run=dry_run, registry=unmeasured)
-        assert str(tmp_path / "file") in str(caught.value)
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import turns
 from turns import of_this_turn, turn
 
 from lagbench.data.manifest import read_manifest
@@ -83,13 +82,3 @@ def test_one_scenario_is_made_to_the_bit(split: str, name: str, tmp_path: Path) 
     result = generate(split, name, scenarios=(scenario,), root=tmp_path)
     assert result.simulated == (scenario,)
     assert result.verdict.endswith("equal to datasets.yaml")
-
-
-def test_every_data_set_has_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight turns in a row make a scenario of each of them."""
-    made = set()
-    for number in range(TURNS):
-        monkeypatch.setattr(turns, "turn", lambda number=number: number)
-        made.update(of_this_turn(recorded_sizes(), turns=TURNS))
-    assert made == set(recorded_sizes())
-    assert ("cavity", "full") in made

@@ -4,15 +4,10 @@ or not.
 
 from __future__ import annotations
 
-import logging
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pool_tasks
 import pytest
 from cluster_bench import local_cluster, scheduler_process
 from parallel_jobs import (
@@ -25,12 +20,11 @@ from parallel_jobs import (
 from score_bench import ScoreBench, bench_of, straight
 
 from lagbench.data.registry import Registry
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
 from lagbench.scoring.score import ScenarioJob, ScenarioScores
 from lagbench.work import run
-from lagbench.work.cluster import LOGGERS, Cluster
 from lagbench.work.pool import Report
 
 distributed = pytest.importorskip(
@@ -49,27 +43,6 @@ def cluster() -> Iterator[Any]:
 def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
     """Tiny curl noise."""
     return bench_of(generated, unmeasured)
-
-
-def test_an_address_that_cannot_be_one_silences_no_logs() -> None:
-    """A program that uses Dask itself goes on logging."""
-    loggers = [logging.getLogger(name) for name in LOGGERS]
-    levels = [logger.level for logger in loggers]
-    with pytest.raises(UsageError), Cluster("nonsense"):
-        pass
-    assert [logger.level for logger in loggers] == levels
-
-
-LOSER = """
-import sys
-from lagbench.errors import WorkFailedError
-from lagbench.work.run import run_all
-from parallel_jobs import take_worker_along
-try:
-    run_all(take_worker_along, {"job 0": 0}, scheduler=sys.argv[1])
-except WorkFailedError as error:
-    print(error.what)
-"""
 
 
 @pytest.fixture
@@ -142,29 +115,6 @@ def test_a_lost_scheduler(losable: str, capfd: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.slow
-def test_a_lost_scheduler_stays_quiet_to_the_end(losable: str) -> None:
-    """Nothing of Dask's is printed either when the process ends."""
-    there = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    command = [sys.executable, "-c", LOSER, losable]
-    ended = subprocess.run(
-        command, env=there, capture_output=True, text=True, check=True
-    )
-    assert ended.stdout == "the Dask cluster is lost\n"
-    assert ended.stderr == ""
-
-
-@pytest.mark.slow
-def test_a_job_that_kills_every_worker(cluster: Any) -> None:
-    """A job that no worker survives ends as failed work that names it, not as a
-    hang.
-    """
-    with pytest.raises(WorkFailedError):
-        run.run_all(
-            take_worker_along, {"job 0": 0}, scheduler=cluster.scheduler_address
-        )
-
-
-@pytest.mark.slow
 def test_a_killed_process_changes_nothing(
     bench: ScoreBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,14 +148,3 @@ def test_an_error_of_a_job_is_not_a_lost_cluster(cluster: Any) -> None:
     """The time-out of a job itself arrives as it is."""
     with pytest.raises(WorkFailedError):
         run.run_all(time_out, {"job 0": 0}, scheduler=cluster.scheduler_address)
-
-
-@pytest.mark.slow
-def test_an_error_of_the_system_is_explained_on_a_cluster_too(cluster: Any) -> None:
-    jobs = {"job 0": Path("a file")}
-    with pytest.raises(WorkFailedError) as caught:
-        run.run_all(
-            pool_tasks.lack_permission, jobs, scheduler=cluster.scheduler_address
-        )
-    assert caught.value.what == "no permission"
-    assert caught.value.where == "a file"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import functools
 import os
 import signal
 import subprocess
@@ -12,17 +10,14 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pool_tasks
 import pytest
 from cluster_bench import gone
 
 from lagbench.data.registry import PluginWarning
-from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
-from lagbench.work.machine import available_cores, worker_count
-from lagbench.work.pool import ATTEMPTS, Pool, WorkItem, error_to_send
+from lagbench.errors import LagbenchError, WorkFailedError
+from lagbench.work.pool import ATTEMPTS, Pool, WorkItem
 
 HERE = str(Path(__file__).parents[1])
 
@@ -139,145 +134,13 @@ def test_attempts_are_counted_for_each_submission(tmp_path: Path) -> None:
             marker.unlink()
 
 
-def test_fewer_than_one_worker_is_refused() -> None:
-    """Zero or less is a usage error, not a pool that never works; None means one per
-    core.
-    """
-    for wanted in (0, -1):
-        with pytest.raises(UsageError) as caught:
-            worker_count(wanted)
-        assert caught.value.where == "--workers"
-        with pytest.raises(UsageError) as caught:
-            Pool(wanted)
-        assert caught.value.where == "--workers"
-    assert worker_count(None) == available_cores() >= 1
-    assert worker_count(None, default=1) == 1
-    assert worker_count(3, default=1) == 3
-
-
-def test_workers_are_a_whole_number_of_any_type() -> None:
-    """A whole number of NumPy was refused, and True was one worker."""
-    count = worker_count(np.int64(2))  # type: ignore[arg-type]
-    assert type(count) is int
-    assert count == 2
-    values: list[Any] = [True, 2.0, "2"]
-    for value in values:
-        with pytest.raises(UsageError, match="no whole number") as caught:
-            worker_count(value)
-        assert caught.value.where == "--workers"
-
-
-def test_errors_of_ours_arrive_whole() -> None:
-    """A LagbenchError keeps its class, exit code and all of its parts."""
-    error = failure("a", pool_tasks.refuse)
-    assert type(error) is DataError
-    assert error.what == "what is wrong"
-    assert error.where == "here"
-    assert error.expected == 1
-    assert error.got == 2
-    assert error.fix == "mend it"
-    assert error.exit_code == 4
-
-
-def test_other_errors_bring_their_traceback(package: Callable[..., Path]) -> None:
-    """Any other error of a task names the line that raised it. Where the line belongs
-    to a package that adds a split, the error names the package.
-    """
-    error = failure("a", pool_tasks.crash)
-    assert type(error) is WorkFailedError
-    assert error.what == "a worker crashed"
-    assert "ZeroDivisionError" in str(error)
-    assert "pool_tasks.py" in str(error)
-    package("generators", "pool_tasks")
-    error = failure("a", pool_tasks.crash)
-    assert "pool_tasks.py" in str(error.where)
-    assert "ZeroDivisionError" in str(error.got)
-
-
-def test_an_error_of_the_system_is_explained_as_elsewhere() -> None:
-    """A missing permission is no fault of lagbench, wherever it is missing."""
-    task = functools.partial(pool_tasks.lack_permission, Path("a file"))
-    error = failure("a", task)
-    assert error.what == "no permission"
-    assert error.where == "a file"
-    assert error.exit_code == 5
-
-
-def test_a_worker_without_memory_is_no_fault_of_lagbench() -> None:
-    """The message says how to get memory, and no traceback stands in it."""
-    error = error_to_send(MemoryError("Unable to allocate 5.00 GiB"))
-    assert type(error) is WorkFailedError
-    assert "5.00 GiB" in str(error.got)
-    assert "--workers" in str(error.fix)
-
-
-@pytest.mark.parametrize(
-    ("code", "fix"),
-    [
-        (errno.EMFILE, "ulimit -n"),
-        (errno.EAGAIN, "ulimit -u"),
-        (errno.EFBIG, "ulimit -f"),
-    ],
-)
-def test_a_limit_of_the_system_is_no_fault_of_lagbench(code: int, fix: str) -> None:
-    error = error_to_send(OSError(code, os.strerror(code)))
-    assert type(error) is WorkFailedError
-    assert fix in str(error.fix)
-
-
-def test_a_locked_file_is_no_limit_of_processes() -> None:
-    """HDF5 gives a file that is locked the number of a limit of processes."""
-    text = "unable to lock file, errno = 11"
-    error = error_to_send(BlockingIOError(errno.EAGAIN, text))
-    assert "ulimit" not in str(error)
-
-
-def test_the_death_of_a_worker_with_a_limit_of_processor_time_names_the_limit() -> None:
-    """The system may have killed the worker at the end of that time."""
-    program = f"""
-import sys
-sys.path.insert(0, {HERE!r})
-import pool_tasks
-from lagbench.errors import WorkFailedError
-from lagbench.work.pool import Pool, WorkItem
-
-with Pool(1) as pool:
-    pool.submit(WorkItem(name="a", function=pool_tasks.die))
-    try:
-        list(pool.events())
-    except WorkFailedError as error:
-        print(error)
-"""
-    done = subprocess.run(
-        ["sh", "-c", 'ulimit -t 100; exec "$0" -c "$1"', sys.executable, program],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    assert "ulimit -t" in done.stdout
-
-
-def test_errors_of_the_system_that_nobody_explains_bring_their_traceback(
-    package: Callable[..., Path],
-) -> None:
-    """So do those that cannot be sent, and those of a package name the package."""
-    error = failure("a", pool_tasks.break_a_pipe)
-    assert error.what == "a worker crashed"
-    assert "1 at here" in str(error)
-    package("generators", "pool_tasks")
-    error = failure("a", functools.partial(pool_tasks.lack_permission, Path("file")))
-    assert error.what == "a package failed in a worker"
-
-
 def test_a_result_that_cannot_be_sent_is_an_error_of_the_task() -> None:
     """It is not taken for the death of a worker, and the worker goes on."""
     with Pool(1) as pool:
         pool.submit(WorkItem(name="a", function=pool_tasks.lock))
         with pytest.raises(WorkFailedError) as caught:
             list(pool.events())
-        assert caught.value.what == "a worker crashed"
-        assert "lock" in str(caught.value.got)
+        assert "lock" in str(caught.value)
         item = WorkItem(name="b", function=pool_tasks.square, arguments=(3,))
         pool.submit(item)
         assert [event.value for event in pool.events()] == [1, 9]
