@@ -202,7 +202,7 @@ def test_a_new_major_version_is_recorded_in_place_of_the_old_one(
     assert run(generated.root, registry) == 0
     text = registry.read_text()
     old_version = load(registry).size(SPLIT, SIZE).version
-    place = f"  {SPLIT}:\n    version: "
+    place = f"      {SIZE}:\n        version: "
     assert text.count(f"{place}{old_version}") == 1
     registry.write_text(text.replace(f"{place}{old_version}", f"{place}3.0.0"))
 
