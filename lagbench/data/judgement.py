@@ -113,8 +113,9 @@ def judge_trajectory(
         where = f"{name}, frame {number}"
         _refuse_missing(position, where)
         _refuse_together(raw_position, where)
+        if box is None:
+            box = unit_box(position.shape[1])
         if number == 0:
-            box = box or unit_box(position.shape[1])
             _refuse_lone_particle(position, where)
         sides.append((position.min(axis=0), position.max(axis=0)))
         moments.append(_moments(position))
@@ -261,8 +262,9 @@ class _Motion:
         points = box.tree_points(self.before)
         count = min(NEIGHBOURS, len(points))
         tree = box.tree(self.before)
-        distances, rows = tree.query(points[self.samples], k=count)
-        self.others.append(tree.query(box.tree_points(position[self.samples]))[0])
+        distances, rows = map(np.asarray, tree.query(points[self.samples], k=count))
+        old_places = tree.query(box.tree_points(position[self.samples]))
+        self.others.append(np.asarray(old_places[0]))
         own_step = step[self.samples]
         surroundings = np.median(step[rows[:, 1:]], axis=1)
         self.gaps.append(distances[:, 1])
@@ -514,7 +516,8 @@ def find_shared_frames(
         tree = cKDTree(earlier)
         nearest = np.arange(1, min(MOST_COPIES, len(earlier)) + 1)
         for number in range(start, start + len(judgements_of[subset])):
-            distances, rows = tree.query(frames_of[number], k=nearest, p=np.inf)
+            found = tree.query(frames_of[number], k=nearest, p=np.inf)
+            distances, rows = map(np.asarray, found)
             for near, row in zip(distances, rows, strict=True):
                 for owner in set(owners[row[near < SAME]].tolist()):
                     shared[owner, number] = shared.get((owner, number), 0) + 1

@@ -149,9 +149,10 @@ def adopt(
     notes = [*_shorten(notes), *more_notes, *find_shared_frames(judgements)]
 
     trajectories = {}
+    lone_spacing = float(description.radius or 1.0)  # of a single particle
     for subset, members in judged.items():
         trajectories[subset] = [
-            (member.open, description.spacing or member.spacing or description.radius)
+            (member.open, description.spacing or member.spacing or lone_spacing)
             for member in members
         ]
     meter.begin("writing", total=total, scenarios=total)

@@ -149,9 +149,9 @@ def export(
     scenario_count = sum(map(len, paths_of.values()))
     meter.begin("exporting", total=scenario_count, scenarios=scenario_count)
     count = partial(meter.count, 1, scenarios=1)
+    shapes: dict[str, list[tuple[int, int]]] = {}
+    files: list[Path] = []
     if format == "vtkhdf":
-        files = []
-        shapes = {}
         for subset, paths in paths_of.items():
             shapes[subset] = []
             for path in paths:
@@ -167,8 +167,6 @@ def export(
             # taking it off a float32 above it and below 16 loses no bit
             origin = np.floor(lows * 2**20) / 2**20
         module: Any = gns_npz if format == "gns-npz" else lagrangebench_h5
-        shapes = {}
-        files = []
         for subset, paths in paths_of.items():
             files.append(target / f"{subset}{FORMATS[format]}")
             runs = _read_runs(paths, module, tier.frame_interval, walls, count)

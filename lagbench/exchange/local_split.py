@@ -387,7 +387,7 @@ class _Writer:
             statistics=file_statistics(train_paths, self.box),
         )
         write_manifest(self.root, manifest)
-        measured = {
+        measured: dict[str, Any] = {
             "dataset_sha256": manifest.dataset_sha256,
             "subset_sha256": manifest.subset_sha256,
             "scenario_sha256": short_hashes,

@@ -374,7 +374,7 @@ def _find_materials(
     if "kinds" in dataset.attrs:
         materials["-1"] = DROP  # padding
     materials |= kinds
-    material = np.empty(count, np.int8)
+    codes = np.empty(count, np.int8)
     for value in np.unique(values):
         word = materials.get(str(value))
         if word is None:
@@ -386,14 +386,14 @@ def _find_materials(
                 f"--kinds {value}={DROP}"
             )
         code = -1 if word == DROP else MATERIALS.index(word)
-        material[values == value] = code
-    is_kept = material >= 0
+        codes[values == value] = code
+    is_kept = codes >= 0
     if not is_kept.any():
         raise UsageError(f"{name}: --kinds leaves out all particles; keep some")
     notes = []
     if not is_kept.all():
         notes.append(f"{name}: {np.count_nonzero(~is_kept)} particles are left out")
-    return material[is_kept], is_kept, notes
+    return codes[is_kept], is_kept, notes
 
 
 def parse_kinds(kinds: Mapping[Any, str] | str | None) -> dict[str, str]:

@@ -170,7 +170,7 @@ def as_dataset(arrays: Mapping[str, Any], options: Reading) -> xr.Dataset:
     """
     known = ("position", "positions", "particles")
     name = options.positions or next((key for key in known if key in arrays), None)
-    if name not in arrays:
+    if name is None or name not in arrays:
         raise UnreadableFileError(
             f"no array is named position, but {', '.join(arrays) or 'none'}; name the "
             "one of the positions: --positions NAME"
@@ -311,7 +311,9 @@ def _open_group(path: Path, group: str, name: str, axes: Sequence[str]) -> xr.Da
         chunks = (1, *item.shape[1:]) if item.ndim > 2 else -1
         is_number = item.dtype.kind in "iuf"
         if is_number:
-            arrays[key] = dask.array.from_array(item, chunks=chunks, name=False)
+            arrays[key] = dask.array.from_array(  # type: ignore[no-untyped-call]
+                item, chunks=chunks, name=False
+            )
     boundary = arrays.pop("boundary", None) if name == "particles" else None
     dataset = as_dataset(arrays, Reading(axes=axes, positions=name))
     for key, values in attributes.items():
