@@ -38,9 +38,7 @@ from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scorer
 from lagbench.scoring.score import ScenarioScores
 from lagbench.scoring.task import ScoredTask
-from lagbench.submission import ValidationResult
 from lagbench.submission.format import FileInfo
-from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
 from lagbench.work.run import ONE_THREAD, Meter
 
@@ -75,10 +73,6 @@ SIZE = "tiny"
 SCORE_SCENARIOS = scorer.score_scenarios
 PAINT_PICTURES = cards.paint_pictures
 POOL_USERS = ("lagbench.make.generate.Pool", "lagbench.make.verify.Pool")
-VALIDATION_USERS = (
-    "lagbench.scoring.score.validate",
-    "lagbench.board.submit.validate_predictions",
-)
 SCENARIO_SCORER = "lagbench.scoring.score.score_scenarios"
 PICTURE_PAINTER = "lagbench.make.cards.paint_pictures"
 
@@ -221,27 +215,6 @@ def own_cache(home: Path) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def validation_in_process() -> Iterator[None]:
-    """Validate predictions that are scored without a child process.
-
-    For speed: the child imports netCDF4 anew for every score. tests/test_submission
-    tests the child, and ``as_shipped`` brings it back.
-    """
-
-    def validate_here(
-        path: str | Path, *, isolated: bool = True, **options: Any
-    ) -> ValidationResult:
-        """Validate in this process."""
-        assert isolated
-        return validate(path, isolated=False, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name in VALIDATION_USERS:
-            patch.setattr(name, validate_here)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
 def blank_pictures() -> Iterator[None]:
     """Leave the pictures of cards blank.
 
@@ -319,12 +292,10 @@ def references_once() -> Iterator[None]:
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the exchanges above back for one test.
 
-    It gets workers, the child process, reference predictors and pictures of its own.
+    It gets workers, reference predictors and pictures of its own.
     """
     for name in POOL_USERS:
         monkeypatch.setattr(name, Pool)
-    for name in VALIDATION_USERS:
-        monkeypatch.setattr(name, validate)
     monkeypatch.setattr(SCENARIO_SCORER, SCORE_SCENARIOS)
     monkeypatch.setattr(PICTURE_PAINTER, PAINT_PICTURES)
 

@@ -27,7 +27,6 @@ class Fault:
     make: Callable[[Bench], Path]  # writes the file and returns its path
     check: str  # that must name it
     exit_code: int  # that it must lead to
-    hostile: bool = False  # whether it must be looked at in a child process only
     says: str = ""  # a word that the message must contain
 
 
@@ -38,13 +37,12 @@ def fault(
     check: str,
     exit_code: int = 1,
     *,
-    hostile: bool = False,
     says: str = "",
 ) -> Callable[[Callable[[Bench], Path]], Callable[[Bench], Path]]:
     """Register a function that makes a faulty file."""
 
     def register(make: Callable[[Bench], Path]) -> Callable[[Bench], Path]:
-        FAULTS[make.__name__] = Fault(make, check, exit_code, hostile, says)
+        FAULTS[make.__name__] = Fault(make, check, exit_code, says)
         return make
 
     return register

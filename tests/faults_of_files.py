@@ -5,14 +5,13 @@ from __future__ import annotations
 import gzip
 import os
 import pickle
-import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import netCDF4
-from fault_registry import DIMS, FAULTS, SHAPE, Fault, fault, replace
+from fault_registry import FAULTS, Fault, fault
 from submission_data import Bench
 
 
@@ -132,33 +131,4 @@ def small_chunk_bomb(bench: Bench) -> Path:
     path = bench.copy("small_chunk_bomb.nc")
     with h5py.File(path, "r+") as file:
         file["position"].id.write_direct_chunk((1, 1, 0, 0), _stream(2))
-    return path
-
-
-@fault("readable", 3, hostile=True)
-def large_chunk_bomb(bench: Bench) -> Path:
-    """A chunk of 8 MiB, allowed as such, whose stream of 2 MiB unpacks to 2 GiB."""
-    path = bench.copy("large_chunk_bomb.nc")
-    options = {
-        "maxshape": (None,) * 4,
-        "chunks": (1, 8, 1 << 17, 2),
-        "dtype": "f4",
-        "compression": 1,
-    }
-    with h5py.File(path, "r+") as file:
-        dataset = replace(file, "position", DIMS, shape=SHAPE, **options)
-        dataset.id.write_direct_chunk((1, 0, 0, 0), _stream(2))
-    return path
-
-
-@fault("readable", 3, hostile=True)
-def heap_loops(bench: Bench) -> Path:
-    """A global heap that leads HDF5 to an object of length 0, which it passes for
-    ever.
-    """
-    path = bench.copy("heap_loops.nc")
-    data = bytearray(path.read_bytes())
-    start = data.index(b"GCOL")
-    struct.pack_into("<Q", data, start + 24, 2000)
-    path.write_bytes(data)
     return path

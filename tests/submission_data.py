@@ -52,15 +52,12 @@ class Bench:
         shutil.copyfile(self.valid, target)
         return target
 
-    def validate(
-        self, path: Path, *, isolated: bool = False, require_truth: bool = False
-    ) -> ValidationResult:
+    def validate(self, path: Path, *, require_truth: bool = False) -> ValidationResult:
         """Validate a file against this data set."""
         return validate(
             path,
             root=self.root,
             registry=self.registry,
-            isolated=isolated,
             require_truth=require_truth,
         )
 

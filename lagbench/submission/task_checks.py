@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from lagbench.data.layout import format_ids, major_of, quote_root
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_or_empty
-from lagbench.data.registry import Size
-from lagbench.errors import format_count
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import UnreadableFileError, UsageError, format_count
 
-from .format import FileInfo
+from .format import MAX_NAME, FileInfo
 from .issues import IssueCollector, quote
 
 HASH = re.compile(r"[0-9a-f]{64}")
@@ -26,55 +26,32 @@ MAX_QUOTED_NUMBERS = 20
 """Most numbers that are quoted one by one."""
 
 
-def check_split(
-    info: FileInfo,
-    size: Size | None,
-    *,
-    lookup_error: Mapping[str, str] | None,
-    issues: IssueCollector,
+def find_size(
+    info: FileInfo, registry: Registry, issues: IssueCollector
 ) -> Size | None:
-    """Return the registry's entry of the split, size and subset that a file names.
-
-    The caller has looked for the entry before, from an earlier reading of the file. So
-    only the names of split and size are compared here.
-
-    Args:
-        info: what the file says.
-        size: the entry that the caller found; None where there is none.
-        lookup_error: the parts of the caller's error (what, where, expected, got and
-            fix), which may be about the split, the size or the subset; None where the
-            caller found an entry.
-        issues: receives an issue where there is no entry.
-
-    Returns:
-        The entry, or None where there is none.
-    """
-    split_name = info.attributes["split"]
-    size_name = info.attributes["size"]
-    if not isinstance(split_name, str) or not isinstance(size_name, str):
+    """Return the split, size and subset that a file names; None if there is none."""
+    split = info.attributes["split"]
+    size = info.attributes["size"]
+    if not isinstance(split, str) or not isinstance(size, str):
         issues.skip("the file does not name its split and size", "split")
         return None
     issues.complete("split")
-    if size is not None and (size.split, size.name) == (split_name, size_name):
-        return size
-    if lookup_error is None:
-        # somebody wrote the file between the two times that it was read
-        lookup_error = {
-            "what": "no such split and size",
-            "where": "attributes 'split' and 'size'",
-            "expected": "a split and size that `lagbench list` shows",
-            "got": f"{quote(split_name)}, {quote(size_name)}",
-            "fix": "validate the file again when it is written",
-        }
-    issues.error(
-        "split",
-        lookup_error["what"],
-        where=lookup_error["where"],
-        expected=lookup_error["expected"],
-        got=lookup_error["got"],
-        fix=lookup_error["fix"],
-    )
-    return None
+    subset = info.attributes["subset"]
+    if not isinstance(subset, str):
+        subset = "test"
+    try:
+        return registry.size(split, size).scored_on(subset)
+    except (UsageError, UnreadableFileError) as error:
+        issues.error(
+            "split",
+            error.what[:MAX_NAME],
+            where="attributes 'split', 'size' and 'subset'",
+            expected="a split and size that `lagbench list` shows",
+            got=f"{quote(split)}, {quote(size)}, {quote(subset)}",
+            fix="predictions for a split of your own are validated and scored with "
+            "--split own/",
+        )
+        return None
 
 
 def check_dataset(

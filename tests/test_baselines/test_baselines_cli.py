@@ -71,7 +71,7 @@ def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) ->
     )
     assert predicted.exit_code == 0, predicted.output
     assert json.loads(predicted.stdout)["seconds_per_frame"] > 0
-    assert validate("predictions.nc", isolated=False).valid
+    assert validate("predictions.nc").valid
 
 
 @pytest.mark.slow
@@ -155,7 +155,7 @@ def test_a_local_split_is_predicted_by_its_folder(
             predicted.stdout
         )
         root = original.folder.parent
-        assert validate("predictions.nc", root=root, isolated=False).valid
+        assert validate("predictions.nc", root=root).valid
     other = lagbench(*weights, "--split", "curl-noise")
     assert other.exit_code == 2
     assert "where: --split" in other.stderr

@@ -39,7 +39,7 @@ def test_a_trained_model_gets_a_skill(
     )
     output = tmp_path / "predictions.nc"
     predict(trained.weights, output, root=root)
-    assert not lagbench.validate(output, root=root, isolated=False).errors
+    assert not lagbench.validate(output, root=root).errors
     card = lagbench.score(output, root=root)
     size = load().size(split, "tiny")
     assert set(card.scores) >= {"persistence", "frozen-field", "projection"}

@@ -201,7 +201,7 @@ def test_a_training_and_its_predictions_go_through_the_ends(
     box = locate(made.folder).size.box
     error = box.displacement(truth, last)
     assert np.abs(error).max() < 0.01
-    report = lagbench.validate(path, root=root, isolated=False)
+    report = lagbench.validate(path, root=root)
     assert report.valid
 
 

@@ -239,14 +239,14 @@ def test_predictions_cannot_name_paths(own: Path, tmp_path: Path, path: str) -> 
     """
     target = tmp_path / "predictions.nc"
     lagbench.template(str(own), output=target)
-    result = lagbench.validate(target, root=own.parent, isolated=False)
+    result = lagbench.validate(target, root=own.parent)
     assert result.valid
     with h5py.File(target, "a") as file:
         file.attrs["split"] = "../root/own" if path == "relative" else str(own)
-    result = lagbench.validate(target, root=own.parent, isolated=False)
+    result = lagbench.validate(target, root=own.parent)
     checks = [finding.check for finding in result.errors]
     assert checks == ["split"]
-    without_root = lagbench.validate(target, isolated=False)
+    without_root = lagbench.validate(target)
     assert not without_root.valid
 
 

@@ -97,7 +97,7 @@ def test_truth_is_perfect_and_references_are_measured(
     truth = carried(AMPLITUDES[2])[GIVEN:]
     root = made.folder.parent
     lagbench.submission.write(path, {2: truth}, split=made.folder, method="truth")
-    validated = lagbench.validate(path, root=root, isolated=False)
+    validated = lagbench.validate(path, root=root)
     card = lagbench.score(
         path,
         root=root,
@@ -149,7 +149,7 @@ def test_pictures_and_report_are_drawn(made: LocalSplit, tmp_path: Path) -> None
     path = tmp_path / "predictions.nc"
     root = made.folder.parent
     lagbench.template(made.folder, output=path)
-    validated = lagbench.validate(path, root=root, isolated=False)
+    validated = lagbench.validate(path, root=root)
     card = lagbench.score(
         path,
         root=root,

@@ -16,8 +16,8 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from bad_submissions import FAULTS
 from fault_registry import positions, rows, store
+from faults import FAULTS
 from numpy.typing import ArrayLike
 from scenario_factory import make_key, write_scenario
 from submission_data import (
@@ -217,7 +217,6 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
         bench.valid,
         root=tmp_path,
         registry=unmeasured,
-        isolated=False,
     )
     flag = next(f for f in result.findings if f.check == "dataset")
     assert flag.severity == Severity.WARNING

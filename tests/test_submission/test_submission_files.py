@@ -23,8 +23,8 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
-from bad_submissions import FAULTS
 from fault_registry import DIMS, positions, rows, store
+from faults import FAULTS
 from file_size_limit import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -164,7 +164,7 @@ def test_predictions_may_be_written_to_the_home_folder(
     result = template("cavity", "tiny", output="~/t.nc", **location)
     assert result.path == home_folder / "t.nc"
     assert bench.validate(result.path).exit_code == 0
-    assert validate("~/t.nc", isolated=False, **location).valid
+    assert validate("~/t.nc", **location).valid
     with pytest.raises(UsageError) as caught:
         template("cavity", "tiny", output="~/t.nc", **location)
     assert "--overwrite" in caught.value.fix

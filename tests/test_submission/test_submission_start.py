@@ -65,7 +65,7 @@ class World:
             for scenario in self.positions:
                 prediction = predict(self, scenario)
                 writer.add(scenario, prediction)
-        return validate(path, root=self.root, isolated=False)
+        return validate(path, root=self.root)
 
 
 SPLITS = ["cavity", "curl-noise", "fluid", "multimaterial"]
@@ -328,7 +328,7 @@ def test_persistence_and_the_truth_pass_all_checks(
         output=tmp_path / "t.nc",
         root=world.root,
     )
-    persistence = validate(result.path, root=world.root, isolated=False)
+    persistence = validate(result.path, root=world.root)
     assert not persistence.findings
     truth = world.validate(tmp_path / "p.nc", World.truth)
     assert not truth.findings
