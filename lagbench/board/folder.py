@@ -17,7 +17,6 @@ import filelock
 
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.scoring.boards import SUBMISSIONS, require_board
-from lagbench.submission.other_files import MODEL_ENDINGS
 
 Place = tuple[str, str, str]  # split, size and method
 
@@ -37,7 +36,7 @@ ENDINGS = {
     SUBMISSIONS: (".yaml",),
     SCORES: (".nc",),
     REFERENCES: (".nc",),
-    WEIGHTS: (*MODEL_ENDINGS, ".json"),
+    WEIGHTS: (".onnx", ".safetensors", ".json"),
 }
 
 DEPTH = 4  # parts of a path: submissions or scores, split, size, file name

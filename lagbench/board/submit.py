@@ -36,7 +36,6 @@ from lagbench.scoring.score_file_writer import write_statistics
 from lagbench.submission.checks import outside_share
 from lagbench.submission.format import WRITE, Header
 from lagbench.submission.issues import ValidationResult
-from lagbench.submission.other_files import refuse_other_files
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate as validate_predictions
 from lagbench.work.run import Progress
@@ -162,8 +161,6 @@ def submit(
         raise UsageError("an entry needs authors and command; write them to meta.yaml")
     if not 1 <= len(predictions) <= MOST_SEEDS:
         raise UsageError(f"submit takes 1 to {MOST_SEEDS} files, one per seed")
-    for path in map(Path, predictions):
-        refuse_other_files(path)
     if new_board:
         folder.require_room()
     else:

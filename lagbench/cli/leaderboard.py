@@ -109,7 +109,7 @@ def check_command(
         check_regular(path)
     with progress_bar(quiet=quiet or as_json) as progress:
         result = check_board(
-            find_board(board, reads=not recording),
+            find_board(board),
             predictions=predictions or (),
             recording=recording,
             root=root,
@@ -151,7 +151,7 @@ def picture_command(
         raise UsageError(f"{output} must end in .svg or .png; rename it")
     check_output_file(output, overwrite=overwrite)
     check_installed("vl_convert", extra="plots")
-    folder = find_board(board, reads=True)
+    folder = find_board(board)
     chosen = choose_data_sets(Folder(folder).data_sets(), None, size, board=folder)
     write_picture(collect(folder, only=chosen, metrics=()), output)
     print_line(str(output), quiet=quiet)
@@ -204,7 +204,7 @@ def reproduce_command(
     if draw_seed is not None:
         with progress_bar(quiet=quiet or as_json) as progress:
             scores = score_blind(
-                find_board(board, reads=True),
+                find_board(board),
                 entries or (),
                 draw_seed,
                 split=split,
@@ -387,7 +387,7 @@ def show_command(
         size: tiny, mini or full; all by default.
         metric: Metric to show; repeatable.
     """
-    folder = find_board(board, reads=True)
+    folder = find_board(board)
     data_sets = Folder(folder).data_sets()
     chosen = choose_data_sets(data_sets, split, size, board=folder)
     metrics = None if as_json else metric or ()

@@ -171,8 +171,8 @@ def measure(pair: FramePair, metrics: Iterable[Metric]) -> dict[str, float]:
             continue
         try:
             applies = metric.applies(pair)
-        except (Exception, SystemExit) as error:
-            metric.raise_named(error, f"frame {pair.frame}")
+        except Exception as error:
+            raise metric.failure(error, f"frame {pair.frame}") from error
         if applies:
             values[metric.name] = metric.measure(pair)
     return values

@@ -8,14 +8,11 @@ many metrics use it. A metric of another package is a :class:`Metric` as well.
 from __future__ import annotations
 
 import enum
-import functools
-import inspect
 import math
 import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -152,9 +149,6 @@ NAME = re.compile("[a-z][a-z0-9_]{0,63}")
 RESERVED = ("skill",)
 """Names that no metric may have: tables have a row `skill`."""
 
-REAL_KINDS = "biuf"
-"""Kinds of NumPy's types whose values are real numbers."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
@@ -273,128 +267,51 @@ class Metric:
         """Return the statistic of a frame pair, NaN where it is undefined.
 
         Raises:
-            WorkFailedError: it is no number, whether it is defined is neither true nor
-                false, or it would end the program.
+            WorkFailedError: a function of the metric fails, or gives no number.
         """
         if self.statistic is None:
             return math.nan
-
-        value: object = math.nan
         try:
-            is_defined: object = self.defined(pair)
-            is_bool = isinstance(is_defined, (bool, np.bool_))
-            if is_bool and is_defined:
-                value = self.statistic(pair)
-        except (Exception, SystemExit) as error:
-            self.raise_named(error, f"frame {pair.frame}")
-
-        if is_bool and isinstance(value, float):  # nearly always
-            return float(value)
-
-        place = f"frame {pair.frame}"
-        if not is_bool:
-            raise self._failure(
-                "whether a metric is defined is neither true nor false",
-                f"{_line_of_function(self.defined)}, {self.name}, {place}",
-                expected="a bool",
-                got=is_defined,
-            )
-        return self._to_number(value, self.statistic, place)
+            if not self.defined(pair):
+                return math.nan
+            return float(self.statistic(pair))
+        except Exception as error:
+            raise self.failure(error, f"frame {pair.frame}") from error
 
     def per_frame_from(self, *statistics: Floats) -> Floats:
         """Return the value per frame from the statistics in ``of``, shape [frame].
 
         Raises:
-            WorkFailedError: it has another shape, or its values are no real numbers.
+            WorkFailedError: it has another shape, or its values are no numbers.
         """
-        place = "over all frames"
         try:
-            given = np.asanyarray(self.series(*statistics))
-        except (Exception, SystemExit) as error:
-            self.raise_named(error, place)
-        try:
-            series = _as_floats(given)
-        except (TypeError, ValueError, OverflowError):
-            raise self._failure(
-                "the series of a metric has no real numbers",
-                f"{_line_of_function(self.series)}, {self.name}, {place}",
-                expected="a float per frame",
-                got=given,
-            ) from None
+            series = np.asarray(self.series(*statistics), np.float64)
+        except Exception as error:
+            raise self.failure(error, "over all frames") from error
         if series.shape != statistics[0].shape:
-            raise self._failure(
-                "the series of a metric has another shape",
-                f"{_line_of_function(self.series)}, {self.name}, {place}",
-                expected=f"one value per frame, shape {statistics[0].shape}",
-                got=series.shape,
+            raise WorkFailedError(
+                f"the metric {self.name} gives shape {series.shape}, not one value per "
+                f"frame, {statistics[0].shape}; mend its series"
             )
         return series
 
     def over_horizon(self, series: Floats) -> float:
-        """Return the number of a scenario from the value per frame.
+        """Return one number of a scenario from the value per frame.
 
         Raises:
             WorkFailedError: it is no number.
         """
-        place = "over all frames"
         try:
-            value: object = self.over_frames(series)
-        except (Exception, SystemExit) as error:
-            self.raise_named(error, place)
-        return self._to_number(value, self.over_frames, place)
+            return float(self.over_frames(series))
+        except Exception as error:
+            raise self.failure(error, "over the horizon") from error
 
-    def _to_number(self, value: object, function: object, place: str) -> float:
-        """Return the value of a function as a float.
-
-        An array of one element is converted.
-        """
-        # as arrays of other packages raise
-        with suppress(TypeError, ValueError, OverflowError, RuntimeError):
-            return _as_float(value)
-        raise self._failure(
-            "a metric gave no number",
-            f"{_line_of_function(function)}, {self.name}, {place}",
-            expected="a float",
-            got=value,
+    def failure(self, error: Exception, place: str) -> WorkFailedError:
+        """Return the error for a function of the metric that fails."""
+        return WorkFailedError(
+            f"the metric {self.name} failed, {place}: {type(error).__name__}: "
+            f"{str(error)[:200]}; mend it, or uninstall the package that adds it"
         )
-
-    def raise_named(self, error: Exception | SystemExit, place: str) -> NoReturn:
-        """Raise an error of the metric's functions again, with name and place added.
-
-        The name is also the error's attribute ``metric_name``, and the module of the
-        function its attribute ``metric_module``.
-
-        Raises:
-            WorkFailedError: the error would end the program, or takes no attribute.
-        """
-        where = f"{_line_of_call(error)}, {self.name}, {place}"
-        if isinstance(error, SystemExit):
-            what = "a metric would end the program"
-            failure = self._failure(what, where, expected="a number", got=error)
-            raise failure from error
-        try:
-            error.add_note(f"in metric {self.name}, {place}")
-            error.metric_name = self.name  # type: ignore[attr-defined]
-            error.metric_module = _module_of_call(error)  # type: ignore[attr-defined]
-        except AttributeError:  # such as an exception that is a frozen dataclass
-            what = "a metric failed"
-            failure = self._failure(what, where, expected="a number", got=error)
-            raise failure from error
-        raise error
-
-    def _failure(
-        self, what: str, where: str, *, expected: str, got: object
-    ) -> WorkFailedError:
-        """Return the error for a function of the metric that does not work."""
-        error = WorkFailedError(
-            what,
-            where=where,
-            expected=expected,
-            got=f"{type(got).__name__}: {got!r:.60}",
-            fix="mend it, or leave it out: uninstall the package that adds it",
-        )
-        error.metric_name = self.name  # type: ignore[attr-defined]
-        return error
 
     @property
     def is_on_request(self) -> bool:
@@ -434,74 +351,6 @@ class Metric:
         if self.direction is Direction.HIGHER:
             return -value
         return value
-
-
-def _as_floats(values: np.ndarray[Any, Any]) -> Floats:
-    """Return real numbers as floats, and NaN for masked ones.
-
-    NumPy would drop imaginary parts and masks, and read texts and times as numbers.
-
-    Raises:
-        TypeError: a value is complex, a text, a time or another object.
-    """
-    if values.dtype == object:  # as fractions
-        numbers = [_as_float(value) for value in values.ravel()]
-        return np.array(numbers).reshape(values.shape)
-    if values.dtype.kind not in REAL_KINDS:
-        raise TypeError(f"{values.dtype} has no real numbers")
-    if isinstance(values, np.ma.MaskedArray):
-        return np.ma.filled(values.astype(np.float64), np.nan)
-    return np.asarray(values, np.float64)
-
-
-def _as_float(value: object) -> float:
-    """Return a real number as a float; an array of one element is converted.
-
-    Raises:
-        TypeError: it is complex, a text, a time or another object.
-        ValueError: it is an array of several elements, or of none.
-    """
-    if isinstance(value, str | bytes | complex):
-        raise TypeError(f"{type(value).__name__} is no real number")
-    if isinstance(value, np.ndarray | np.generic) and value.dtype != object:
-        return _as_floats(np.asanyarray(value)).item()
-    return float(value)  # type: ignore[arg-type]
-
-
-def _line_of_function(function: object) -> str:
-    """Return the file and the first line of a function; else the name of its module.
-
-    The function may also be a partial one, or an object that can be called.
-    """
-    inner = function
-    while isinstance(inner, functools.partial):
-        inner = inner.func
-    if callable(inner):
-        inner = inspect.unwrap(inner)
-    code = getattr(inner, "__code__", None)
-    if code is None:
-        code = getattr(type(inner).__call__, "__code__", None)
-    if code is None:
-        return str(getattr(function, "__module__", "?"))
-    return f"{code.co_filename}, line {code.co_firstlineno}"
-
-
-def _line_of_call(error: BaseException) -> str:
-    """Return the file and the line at which a function that was called here failed."""
-    trace = error.__traceback__
-    if trace is None or trace.tb_next is None:  # a function without lines in Python
-        return "?"
-    file = trace.tb_next.tb_frame.f_code.co_filename
-    return f"{file}, line {trace.tb_next.tb_lineno}"
-
-
-def _module_of_call(error: BaseException) -> str | None:
-    """Return the name of the module whose function was called here and failed."""
-    trace = error.__traceback__
-    if trace is None or trace.tb_next is None:  # a function without lines in Python
-        return None
-    name: str | None = trace.tb_next.tb_frame.f_globals.get("__name__")
-    return name
 
 
 def metric(

@@ -367,8 +367,11 @@ def find_scores(source: str | Path, board: str | Path | None = None) -> list[Pat
     """
     path = expand_home(source, "method")
     if path.is_dir():
-        for pattern in (JSON_NAME, NETCDF_NAME, f"*/{JSON_NAME}", f"*/{NETCDF_NAME}"):
-            files = sorted(path.glob(pattern))
+        for folders in ([path], sorted(path.glob("*/"))):
+            files = []
+            for folder in folders:
+                own = [folder / JSON_NAME, folder / NETCDF_NAME]
+                files += [file for file in own if file.is_file()][:1]
             if files:
                 return files
         raise UnreadableFileError(
@@ -381,7 +384,7 @@ def find_scores(source: str | Path, board: str | Path | None = None) -> list[Pat
         return [path]
 
     split, size, method = place
-    folder = find_board(board, reads=True) / SCORES / split / size
+    folder = find_board(board) / SCORES / split / size
     files = []
     names = set()
     for file in sorted(folder.glob("*.nc")):

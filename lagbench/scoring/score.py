@@ -21,6 +21,7 @@ from lagbench.data.local import (
 )
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
+    LagbenchError,
     UnreadableFileError,
     UsageError,
     check_installed,
@@ -57,13 +58,6 @@ from .front import (
     compute_speedup,
     front_row,
     seconds_where_measured,
-)
-from .package_metrics import (
-    PackageMetricError,
-    describe_failure,
-    drop_metric,
-    name_metric,
-    own_metric_error,
 )
 from .published_scores import IDENTITY, read_scores
 from .references import check_train, measurable
@@ -127,8 +121,7 @@ def score(
             this very file and root; the file is then not validated again.
 
     Returns:
-        The score card; ``files`` names the written files. A metric of another package
-        that fails is left out, and ``warnings`` says why.
+        The score card; ``files`` names the written files.
 
     Raises:
         UsageError: predictions for another split; an extra that brings no metrics, or
@@ -139,8 +132,8 @@ def score(
         DataError: they were made from another data set, or the test subset is missing
             or damaged.
         WorkFailedError: a worker or the cluster was lost, the disk is full, or the
-            folder cannot be written to, which is seen before the work; or a metric of
-            your own failed.
+            folder cannot be written to, which is seen before the work; or a metric
+            failed.
     """
     own = own_metrics(metrics)
     if own:
@@ -188,17 +181,25 @@ def score(
     if not shipped_references:
         references = measurable(size, data_root)
         check_train(size, data_root, references)
-    score_all = functools.partial(
-        score_scenarios,
+    outcomes = score_scenarios(
         task,
         path,
         info,
+        metrics=_names_or_metrics(measured_metrics, {metric.name for metric in own}),
         references=references,
         workers=workers,
         scheduler=scheduler,
         meter=Meter(progress),
     )
-    measurement = _measure(score_all, measured_metrics, own=own)
+    tallies: dict[str, dict[int, Tally]] = {}
+    for row in outcomes[0].tallies:
+        tallies[row] = {}
+        for outcome in outcomes:
+            tallies[row][outcome.scenario] = outcome.tallies[row]
+    scores: dict[str, Mapping[str, Score]] = {}
+    for row, row_tallies in tallies.items():
+        scores[row] = aggregate(measured_metrics, row_tallies)
+    measurement = Measurement(outcomes=outcomes, tallies=tallies, scores=scores)
     card = _make_card(
         measurement,
         task=task,
@@ -219,7 +220,6 @@ class Measurement:
     outcomes: Sequence[ScenarioScores]  # by ascending id of the scenario
     tallies: Mapping[str, Mapping[int, Tally]]  # statistics by row and scenario
     scores: Mapping[str, Mapping[str, Score]]  # by row and metric
-    failures: Sequence[ValidationIssue]  # of metrics of other packages
 
 
 def _one_worker(workers: int | None, scheduler: str | None) -> int:
@@ -241,38 +241,6 @@ def _one_worker(workers: int | None, scheduler: str | None) -> int:
             "docs/extending.md",
         )
     return 1
-
-
-def _measure(
-    score_all: Callable[..., list[ScenarioScores]],
-    metrics: tuple[Metric, ...],
-    *,
-    own: Collection[Metric],
-) -> Measurement:
-    """Score all scenarios; a metric of another package that fails is left out.
-
-    Args:
-        score_all: :func:`score_scenarios` without its metrics.
-        metrics: the metrics to measure.
-        own: those of them that are not installed; they are not left out.
-    """
-    own_names = {metric.name for metric in own}
-    failures = []
-    while True:
-        try:
-            names = _names_or_metrics(metrics, own_names)
-            outcomes = score_all(metrics=names)
-            tallies, scores = _aggregate(outcomes, metrics)
-        except PackageMetricError as error:
-            if error.metric in own_names:
-                raise own_metric_error(error) from error.__cause__
-            # measured again without it: its column is left out, the others are whole
-            metrics = drop_metric(metrics, error.metric)
-            failures.append(describe_failure(error))
-            continue
-        return Measurement(
-            outcomes=outcomes, tallies=tallies, scores=scores, failures=failures
-        )
 
 
 def _names_or_metrics(
@@ -326,7 +294,7 @@ def _make_card(
         skill=compute_skill([submission], counting),
         speedup=speedup,
         flags=_judge(task, measurement.outcomes, scores),
-        warnings=(*warnings, *measurement.failures, *few_nodes),
+        warnings=(*warnings, *few_nodes),
         preview=next(
             outcome.preview
             for outcome in measurement.outcomes
@@ -375,27 +343,6 @@ def speedup_beside(
         scenarios=scenarios,
     )
     return compute_speedup(model, rows)
-
-
-def _aggregate(
-    outcomes: Sequence[ScenarioScores], metrics: Sequence[Metric]
-) -> tuple[dict[str, dict[int, Tally]], dict[str, Mapping[str, Score]]]:
-    """Return tallies by row and scenario, and scores by row and metric."""
-    tallies: dict[str, dict[int, Tally]] = {}
-    for row in outcomes[0].tallies:
-        tallies[row] = {}
-        for outcome in outcomes:
-            tallies[row][outcome.scenario] = outcome.tallies[row]
-    scores: dict[str, Mapping[str, Score]] = {}
-    try:
-        for row, row_tallies in tallies.items():
-            scores[row] = aggregate(metrics, row_tallies)
-    except Exception as error:
-        named_error = name_metric(error)
-        if named_error is error:
-            raise
-        raise named_error from error
-    return tallies, scores
 
 
 def scores_folder(predictions: Path) -> Path:
@@ -600,12 +547,9 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
                 recorder=recorder,
                 report=report,
             )
-    except Exception as error:
-        named_error = name_metric(error)
-        named_error.add_note(f"scenario {number}")
-        if named_error is error:
-            raise
-        raise named_error from error
+    except LagbenchError as error:
+        error.add_note(f"scenario {number}")
+        raise
 
     preview = None
     if recorder is not None:

@@ -11,7 +11,6 @@ be formed again.
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.hdf5 import open_hdf5, open_variable, read_attribute
-from lagbench.data.registry import PluginWarning
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
@@ -29,7 +27,6 @@ from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
 from lagbench.submission.format import require_name
 
-from .package_metrics import PackageMetricError, name_metric
 from .published_scores import FORMAT, IDENTITY, unreadable_scores
 from .skill import Skill, compute_skill
 
@@ -64,9 +61,7 @@ class SubmissionStatistics:
     def scores(self) -> dict[str, Score]:
         """Return the scores of all installed metrics whose statistics are here.
 
-        Metrics that are formed only when they are named are left out. A metric of
-        another package that fails is left out too, with a
-        :class:`~lagbench.data.registry.PluginWarning`.
+        Metrics that are formed only when they are named are left out.
         """
         names = []
         for name, metric in available().items():
@@ -82,31 +77,7 @@ class SubmissionStatistics:
         for name in names:
             if name in table and statistics.issuperset(table[name].of):
                 metrics[name] = table[name]
-        while True:
-            try:
-                return _aggregate_named(metrics.values(), self.tallies)
-            except PackageMetricError as error:
-                message = f"{error.what}; it is left out: {error.where}: {error.got}"
-                warnings.warn(message, PluginWarning, stacklevel=3)
-                # metrics that follow from it need the stored statistics only
-                del metrics[error.metric]
-
-
-def _aggregate_named(
-    metrics: Iterable[Metric], tallies: Mapping[int, Tally]
-) -> dict[str, Score]:
-    """Return scores by the name of the metric.
-
-    Raises:
-        PackageMetricError: a metric of another package failed.
-    """
-    try:
-        return aggregate(metrics, tallies)
-    except Exception as error:
-        named_error = name_metric(error)
-        if named_error is error:
-            raise
-        raise named_error from error
+        return aggregate(metrics.values(), self.tallies)
 
 
 def read_statistics(path: str | Path) -> SubmissionStatistics:

@@ -2,14 +2,11 @@
 
 HDF5 lets a file show the bytes of other files as its own (external links, external
 storage, virtual data sets) and unpack a few bytes to gigabytes. The headers tell, and
-both are refused before a value is read. HDF5 is also C code that trusts its input, so
-foreign files are first read in a child process under limits.
+both are refused before a value is read.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +25,6 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
-from lagbench.work.machine import run_in_child
 
 from .published_scores import PublishedScores, unreadable_scores
 from .scenario import FILM_RANGE, FRAMES, PARTICLES, SUBMISSION, Preview
@@ -46,19 +42,6 @@ FILM_TOLERANCE = 1e-3
 GROUP = "preview"
 STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
 """Content that a score file may have: plain numbers, in the root and one group."""
-
-# computing time of the child for every 50 files, its start aside [s]
-CPU_SECONDS = 10.0
-
-FILES_PER_PART = 50
-
-# files that may stop a child before the rest is left unread: each costs a child's whole
-# time
-MOST_STOPS = 5
-# time for every 50 files together [s]; a busy machine may need minutes
-WALL_SECONDS = 600.0
-
-UNREAD = "not read, because too many others had to be stopped"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -311,57 +294,3 @@ def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> N
     is_ordered = film_frames == tuple(sorted(film_frames))
     if not set(film_frames).issubset(frames) or not is_ordered:
         raise ValueError("a film of other frames")
-
-
-def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
-    """Return the files that a child cannot read, and why.
-
-    Where a file stops a child, another one reads the rest. After :data:`MOST_STOPS`
-    stops the rest is left unread.
-
-    Raises:
-        WorkFailedError: the machine is too busy (all files together took longer than
-            :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` of them), or has too
-            little memory, or the child itself failed.
-    """
-    reasons: dict[Path, str] = {}
-    pending = list(paths)
-    stops = 0
-    parts = 1 + len(paths) // FILES_PER_PART
-    end = time.monotonic() + WALL_SECONDS * parts
-
-    while pending:
-        if stops == MOST_STOPS:
-            return reasons | dict.fromkeys(pending, UNREAD)
-        names = [str(path) for path in pending]
-        answers = run_in_child(
-            READ,
-            names,
-            seconds=CPU_SECONDS * parts,
-            wall=max(end - time.monotonic(), 0.0),
-        )
-
-        for path, reason in zip(pending, answers.values, strict=False):
-            if reason is not None:
-                reasons[path] = reason
-        read_count = len(answers.values)
-        if read_count < len(pending):
-            culprit = pending[read_count]
-            answers.require_in_time(f"{len(pending)} score files")
-            reasons[culprit] = f"reading it had to be stopped: {answers.stopped}"
-            stops += 1
-        pending = pending[read_count + 1 :]
-    return reasons
-
-
-def explain_unreadable(path: str) -> str | None:
-    """Return the reason why a file cannot be read, for a parent; None if it can."""
-    try:
-        read_score_file(Path(path))
-    except UnreadableFileError as error:
-        return f"{error.what}: {error.got}"
-    return None
-
-
-READ = f"{__name__}.{explain_unreadable.__name__}"
-"""Dotted name of the function that a child calls."""

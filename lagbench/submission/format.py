@@ -153,7 +153,7 @@ class Header:
     # of our solver on one core of the same machine [s]
     solver_seconds_per_frame: float | None = None
     budget: Budget | None = None  # what the training took
-    # the training that made the model; of older files read from the words
+    # the training that made the model
     provenance: TrainingProvenance | None = None
     # scenario id to its number of particles; empty where all have as many
     particle_counts: Mapping[int, int] = field(default_factory=dict)
@@ -360,8 +360,6 @@ def header_of(info: FileInfo) -> Header:
         labels["budget"] = parse_budget(labels["budget"])
     if labels["provenance"]:
         labels["provenance"] = TrainingProvenance.from_json(labels["provenance"])
-    elif labels["training"]:
-        labels["provenance"] = TrainingProvenance.from_sentence(labels["training"])
 
     scenarios = info.integers["scenario"]
     frozen_from = info.integers.get("diverged_at", ())

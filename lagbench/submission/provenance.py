@@ -7,24 +7,12 @@ leaderboard have the sentence alone.
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 MOST_OVERRIDES = 200
 """Most changed options of one training or prediction."""
-
-SENTENCE = re.compile(
-    r"(?P<split>\S+) (?P<size>\S+) (?P<subsets>\S+), recipe (?P<recipe>\S+), "
-    r"step (?P<step>\d{1,15})(?:, (?P<changes>.+))?"
-)
-START = re.compile(r"started from (?P<recipe>\S+), weights (?P<weights>\w+)")
-PREDICTED_WITH = ", predicted with "
-
-# A value may hold commas, as in model.density=[15, 30, 60]: only what begins the next
-# change ends a change.
-NEXT_CHANGE = re.compile(r", (?=started from |[a-z]\w*(?:\.\w+)*=)")
 
 Word = Annotated[str, StringConstraints(pattern=r"^[!-~]{1,200}$")]
 Override = Annotated[str, StringConstraints(pattern=r"^[ -~]{1,1000}$")]
@@ -63,43 +51,6 @@ class TrainingProvenance(_Strict):
     )
 
     @classmethod
-    def from_sentence(cls, sentence: str) -> Self | None:
-        """Return the provenance that `describe` wrote; None for words of a person.
-
-        >>> words = "cavity mini train, recipe cavity/mini, step 900, model.width=48"
-        >>> TrainingProvenance.from_sentence(words).overrides
-        ('model.width=48',)
-        >>> TrainingProvenance.from_sentence("three nights on my own cluster")
-        """
-        training, _, prediction = sentence.partition(PREDICTED_WITH)
-        parts = SENTENCE.fullmatch(training)
-        if parts is None:
-            return None
-
-        overrides = _split_changes(parts["changes"])
-        start = None
-        if overrides:
-            start_parts = START.fullmatch(overrides[-1])
-            if start_parts is not None:
-                start = start_parts.groupdict()
-                overrides = overrides[:-1]
-
-        fields = {
-            "split": parts["split"],
-            "size": parts["size"],
-            "subsets": tuple(parts["subsets"].split("+")),
-            "recipe": parts["recipe"],
-            "step": int(parts["step"]),
-            "overrides": overrides,
-            "start": start,
-            "prediction_overrides": _split_changes(prediction),
-        }
-        try:
-            return cls.model_validate(fields)
-        except ValidationError:
-            return None
-
-    @classmethod
     def from_json(cls, text: str) -> Self | None:
         """Return the provenance that a text holds as JSON; None where it holds none."""
         try:
@@ -133,23 +84,3 @@ class TrainingProvenance(_Strict):
             settings = ", ".join(self.prediction_overrides)
             changes.append(f"predicted with {settings}")
         return ", ".join(changes)
-
-    def training_only(self) -> Self:
-        """Return the provenance without the options that the prediction changed."""
-        return self.model_copy(update={"prediction_overrides": ()})
-
-    def shared_by_seeds(self) -> Self:
-        """Return the part that all seeds of a method share.
-
-        Each seed has a best step of its own, and starts from weights of its own.
-        """
-        start = self.start
-        if start is not None:
-            start = start.model_copy(update={"weights": "any"})
-        return self.model_copy(update={"step": 0, "start": start})
-
-
-def _split_changes(words: str | None) -> tuple[str, ...]:
-    if not words:
-        return ()
-    return tuple(NEXT_CHANGE.split(words))

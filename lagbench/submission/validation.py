@@ -184,7 +184,7 @@ def _check_values(
         except DataError as error:
             if require_truth:
                 issues.add_exception("dataset", error)
-            issues.skip(f"{error.what} in {truth.root}", *TRUTH_CHECKS)
+            issues.skip(f"{error.what} in {truth.root}: {error.fix}", *TRUTH_CHECKS)
             return content_hash
         try:
             truth.check()

@@ -17,9 +17,7 @@ import pytest
 from command_line import Result
 from score_bench import ScoreBench, half_right, still, straight
 
-from lagbench.cli import output
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.figures.tables import Table
 from lagbench.metrics import differ
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.compare import compare
@@ -360,30 +358,6 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
     assert str(entries) in str(caught.value)
 
 
-def refused_before_scoring(
-    name: str,
-    scored: Folders,
-    entries: Path,
-    bench: ScoreBench,
-    monkeypatch: pytest.MonkeyPatch,
-) -> UsageError:
-    """Return why predictions are not compared with a name; scoring them fails."""
-
-    def score_nothing(*_: object, **__: object) -> None:
-        pytest.fail("the predictions were scored")
-
-    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", score_nothing)
-    with pytest.raises(UsageError) as caught:
-        compare(
-            scored["still"] / "predictions.nc",
-            name,
-            board=entries,
-            root=bench.root,
-            registry=bench.registry,
-        )
-    return caught.value
-
-
 WORSE_AND_BETTER = [0.5, 1.5, 1.5, 1.5, 1.5, 1.5]
 
 
@@ -450,24 +424,6 @@ def test_lines_explain_only_what_the_tables_show(tmp_path: Path) -> None:
     _, _, undefined, chance = comparison_lines(compare(d, c))
     assert undefined.startswith("†")
     assert chance.startswith("?")
-
-
-@pytest.mark.parametrize("every", [False, True])
-def test_a_comparison_fits_a_terminal(scored: Folders, every: bool) -> None:
-    """Each of both tables is one block of 80 columns, whatever the digits are."""
-    result = compare(scored["still"], scored["straight"])
-    metrics = {}
-    for name, comparison in result.metrics.items():
-        test = replace(
-            comparison.test,
-            difference=-1.23e-06,
-            interval=(-2.34e-06, -1.11e-07),
-        )
-        metrics[name] = replace(comparison, test=test)
-    wide = replace(result, metrics=metrics)
-    for table in comparison_tables(wide, every=every):
-        blocks = list(output.split_table(table, gap=output.NARROW_GAP))
-        assert len(blocks) == 1
 
 
 def test_scores_nc_has_the_best_reference(scored: Folders) -> None:
@@ -738,36 +694,6 @@ def test_lines_count_the_undefined_frames_of_every_metric_shown(
     (line,) = [line for line in flag_lines(card, every=True) if line.startswith("†")]
     _, _, counts = line.partition(": ")
     assert {count.split()[0] for count in counts.split(", ")} == marked_names
-
-
-REMARK = "reproduced, 2 of 20 scenarios, hybrid"
-
-
-@pytest.fixture
-def print_remarks(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[[int, int], list[str]]:
-    """A function that prints columns and a remark on a terminal, and returns lines."""
-
-    def print_on_terminal(width: int, columns: int) -> list[str]:
-        monkeypatch.setenv("COLUMNS", str(width))
-        is_terminal = property(lambda _: True)
-        monkeypatch.setattr("rich.console.Console.is_terminal", is_terminal)
-        names = [f"column-{number}" for number in range(columns)]
-        row = ("gns", *(["1.0"] * columns), REMARK)
-        table = Table("", ("row", *names, "remarks"), (row,))
-        output.print_tables([table], is_narrow=True, last_column=16)
-        printed = capsys.readouterr().out
-        return re.sub(r"\x1b\[[0-9;]*m", "", printed).splitlines()
-
-    return print_on_terminal
-
-
-def assert_unreadable(path: Path) -> None:
-    """Assert that a file is refused, and that the error names it."""
-    with pytest.raises(UnreadableFileError) as caught:
-        compare(path, "persistence")
-    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import re
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -253,19 +252,6 @@ def test_workers_write_the_same_bytes(
     assert_every_frame_counted_once(reports, bench)
 
 
-def test_predictions_and_scores_may_lie_in_the_home_folder(
-    bench: ScoreBench, predictions: Path, home_folder: Path
-) -> None:
-    """By default scores lie beside the predictions."""
-    shutil.copy(predictions, home_folder / "mine.nc")
-    places = {None: home_folder / "mine", "~/scores": home_folder / "scores"}
-    for output_dir, folder in places.items():
-        card = scoring.score(
-            "~/mine.nc", root=bench.root, registry=bench.registry, output_dir=output_dir
-        )
-        assert [path.parent for path in card.files] == [folder, folder]
-
-
 def test_the_order_of_scenarios_does_not_change_the_bytes(
     bench: ScoreBench,
     persistence_card: ScoreCard,
@@ -501,7 +487,7 @@ def test_predictions_for_another_split_are_refused(
     path = bench.submit(tmp_path / "predictions.nc", half_right)
     with pytest.raises(UsageError) as caught:
         bench.evaluate(path, split="fluid")
-    assert caught.value.expected == "fluid"
+    assert "fluid" in str(caught.value)
     card = bench.evaluate(path, split=bench.size.split)
     assert card.skill is not None
 
@@ -605,23 +591,6 @@ def test_what_is_no_own_metric_is_refused(
     assert None not in (error.where, error.expected, error.got, error.fix)
 
 
-def test_an_own_metric_that_fails_is_named(bench: ScoreBench, tmp_path: Path) -> None:
-    """The error is raised from that of the function; no warning hides it."""
-
-    def broken(pair: FramePair) -> float:
-        return pair.truth.positions  # type: ignore[attr-defined, no-any-return]
-
-    path = bench.submit(tmp_path / "predictions.nc", still)
-    with pytest.raises(WorkFailedError, match="broken") as caught:
-        bench.evaluate(path, metrics=[broken])
-    assert isinstance(caught.value.__cause__, AttributeError)
-    assert "scenario" in str(caught.value.where)
-    assert "metrics=" in str(caught.value.fix)
-    assert "package" not in str(caught.value)
-    line = broken.__code__.co_firstlineno + 1
-    assert str(caught.value.where).startswith(f"{__file__}, line {line}, ")
-
-
 def test_an_own_metric_that_fails_leaves_no_file_open(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
@@ -637,102 +606,6 @@ def test_an_own_metric_that_fails_leaves_no_file_open(
     after = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE)
     assert after == before
     assert caught.value.__cause__ is not None
-
-
-def test_the_failing_line_of_an_own_metric_is_that_in_its_file(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
-    """Not a line of NumPy, in which the error was raised."""
-
-    def reshape(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.split(values, 7)[0]
-
-    def broken(pair: FramePair) -> float:
-        return float(reshape(np.ones(3)).mean())
-
-    path = bench.submit(tmp_path / "predictions.nc", still)
-    with pytest.raises(WorkFailedError) as caught:
-        bench.evaluate(path, metrics=[broken])
-    line = reshape.__code__.co_firstlineno + 1
-    assert str(caught.value.where).startswith(f"{__file__}, line {line}, ")
-
-
-NO_NUMBER = """
-import functools
-
-from lagbench.metrics import Direction, Metric
-
-def my_text(pair):
-    return "many" if pair.frame > 10 else 1.0
-
-def undecided(pair):
-    return "perhaps"
-
-def my_array(pair, word):
-    return [word, word]
-
-def make_metric(name, **functions):
-    return Metric(
-        name=name, family="mine", unit="1", direction=Direction.LOWER,
-        perfect=0.0, source="here", summary="none", **functions,
-    )
-
-METRICS = (
-    make_metric("my_text", statistic=my_text),
-    make_metric("my_undecided", statistic=my_text, defined=undecided),
-    make_metric("my_array", statistic=functools.partial(my_array, word="few")),
-    make_metric(
-        "my_total", statistic=lambda pair: 1.0, over_frames=lambda values: "all"
-    ),
-)
-"""
-"""A package whose metrics give no numbers."""
-
-
-def test_a_value_of_a_package_that_is_no_number_is_in_the_warning(
-    bench: ScoreBench, predictions: Path, package: Callable[..., Path]
-) -> None:
-    """It has the value, and the line of the function that returned it."""
-    module = package("metrics", "no_number:METRICS", NO_NUMBER)
-    card = bench.evaluate(predictions, workers=1)
-    by_metric = {}
-    for warning in card.warnings:
-        (name,) = re.findall(r"my_\w+", warning.what)
-        by_metric[name] = warning
-    expected = {
-        "my_text": (6, "many", "frame 11"),
-        "my_undecided": (9, "perhaps", "frame"),
-        "my_array": (12, "few", "frame"),
-        "my_total": (26, "all", "over all frames"),
-    }
-    assert set(by_metric) == set(expected)
-    for name, (line, value, place) in expected.items():
-        text = str(by_metric[name].got)
-        assert f"{module}, line {line}, " in text
-        assert f"'{value}'" in text
-        assert place in text
-        assert "\\n" not in text
-        assert "..." not in text
-
-
-class MuteError(Exception):
-    """An exception whose author forgot an attribute."""
-
-    def __str__(self) -> str:
-        """Fail to return a text."""
-        return str(self.missing)  # type: ignore[attr-defined]
-
-
-def test_an_own_metric_may_raise_an_exception_without_a_text(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
-    def broken(pair: FramePair) -> float:
-        raise MuteError
-
-    path = bench.submit(tmp_path / "predictions.nc", still)
-    with pytest.raises(WorkFailedError, match="broken") as caught:
-        bench.evaluate(path, metrics=[broken])
-    assert "MuteError" in str(caught.value.got)
 
 
 @pytest.mark.parametrize("metrics", ["vorticity_rmse", ["vorticity_rmse"]])

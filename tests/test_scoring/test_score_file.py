@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from numpy.typing import NDArray
 from score_bench import ScoreBench, straight
 
-from lagbench.data.registry import PluginWarning
 from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.metrics import Tally, aggregate, select
 from lagbench.metrics.aggregate import round_statistics
@@ -294,41 +292,6 @@ def test_scores_nc_reads_back_to_the_bit(card: ScoreCard) -> None:
         assert_array_equal(tally.total, expected.total)
         assert_array_equal(tally.weight, expected.weight)
         assert_array_equal(tally.undefined, expected.undefined)
-
-
-FAILING = """
-from lagbench.metrics import Direction, Metric
-
-def divide(values):
-    return values / "2"
-
-HALF = Metric(
-    name="my_half", family="mine", unit="1", direction=Direction.LOWER,
-    perfect=0.0, source="here", summary="none", of=("velocity_mse",), series=divide,
-)
-DOUBLE = Metric(
-    name="my_double", family="mine", unit="1", direction=Direction.LOWER,
-    perfect=0.0, source="here", summary="none", of=("velocity_mse",),
-    series=lambda values: 2.0 * values,
-)
-METRICS = (HALF, DOUBLE)
-"""
-"""A package with a metric that cannot be formed, and one that can."""
-
-
-@pytest.mark.filterwarnings("default:the metric my_half failed")
-def test_a_metric_of_a_package_that_fails_is_left_out(
-    card: ScoreCard, package: Callable[..., Path]
-) -> None:
-    """The others are formed; the warning has the line that failed."""
-    module = package("metrics", "failing_half:METRICS", FAILING)
-    statistics = read_statistics(card.files[1])
-    with pytest.warns(PluginWarning, match="my_half") as caught:
-        scores = statistics.scores()
-    assert list(scores) == [*card.submission, "my_double"]
-    expected = 2.0 * card.submission["velocity_mse"].values
-    assert_allclose(scores["my_double"].values, expected, rtol=1e-6)
-    assert f"{module}, line 5" in str(caught[0].message)
 
 
 def test_scores_json_has_what_a_comparison_needs(card: ScoreCard) -> None:

@@ -4,7 +4,6 @@ first.
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import h5py
@@ -13,11 +12,8 @@ import pytest
 from board_bench import SCORES, BoardBench, copied
 
 from lagbench.board.check import check_board
-from lagbench.errors import UnreadableFileError, WorkFailedError
-from lagbench.scoring import score_file_checks as isolation
-from lagbench.scoring.score_file_checks import find_unreadable, read_score_file
-
-PACKAGE = Path(isolation.__file__).parents[2]
+from lagbench.errors import UnreadableFileError
+from lagbench.scoring.score_file_checks import read_score_file
 
 
 @pytest.fixture
@@ -148,71 +144,3 @@ def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
     own.rehash("noisy")
     (finding,) = check_board(own.folder, registry=own.registry).findings
     assert "noisy.nc" in finding
-
-
-def test_the_child_refuses_infinite_maps_and_histograms(own: BoardBench) -> None:
-    """There, NumPy's warning of an overflow is no error."""
-    secret = own.folder.parent / "secret"
-    paths = []
-    for name, variable in (("noisy", "vorticity"), ("flipping", "histogram")):
-        path = own.folder / SCORES / f"{name}.nc"
-        hostile(path, f"beyond float32: {variable}", secret)
-        paths.append(path)
-    assert set(find_unreadable(paths)) == set(paths)
-
-
-def use_child(monkeypatch: pytest.MonkeyPatch, folder: Path, program: str) -> None:
-    """Let the child run another program."""
-    (folder / "other_child.py").write_text(program)
-    monkeypatch.setenv("PYTHONPATH", f"{folder}:{PACKAGE}")
-    monkeypatch.setattr(isolation, "READ", "other_child.read")
-
-
-def test_the_child_is_limited_and_started_anew(
-    own: BoardBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It names the damaged file; a file that stops it costs that file only."""
-    good = own.folder / SCORES / "noisy.nc"
-    bad = own.folder / SCORES / "flipping.nc"
-    bad.write_bytes(bad.read_bytes()[:5000])
-    assert set(find_unreadable([good, bad, good])) == {bad}
-    program = (
-        "import os\n"
-        "def read(path):\n"
-        "    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
-    )
-    use_child(monkeypatch, own.folder.parent, program)
-    stopped = find_unreadable([good, bad, good])
-    assert set(stopped) == {bad}
-    assert "had to be stopped" in stopped[bad]
-
-
-def test_many_files_that_stop_the_child_are_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After a few stops the rest is left unread, and every file has its issue."""
-    use_child(
-        monkeypatch, tmp_path, "open('starts', 'a').write('x'); import os; os.abort()"
-    )
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(isolation, "MOST_STOPS", 2)
-    files = [tmp_path / f"{i}.nc" for i in range(9)]
-    found = find_unreadable(files)
-    assert Path("starts").read_text() == "xx"
-    assert list(found) == files
-    assert ["reading it had to be" in said for said in found.values()] == [True] * 2 + [
-        False
-    ] * 7
-    assert found[files[-1]] == isolation.UNREAD
-
-
-def test_no_file_is_accused_of_a_busy_machine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A child that only waits ends the reading of all files: none is at fault."""
-    use_child(monkeypatch, tmp_path, "import time; time.sleep(60)")
-    monkeypatch.setattr(isolation, "WALL_SECONDS", 0.5)
-    started = time.monotonic()
-    with pytest.raises(WorkFailedError, match="the machine is too busy"):
-        find_unreadable([tmp_path / f"{i}.nc" for i in range(9)])
-    assert time.monotonic() - started < 20.0

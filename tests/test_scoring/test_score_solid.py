@@ -20,7 +20,7 @@ from lagbench.figures.plot import KINDS, draw_frame
 from lagbench.figures.report.report import write_report
 from lagbench.references.predictor import given_in
 from lagbench.references.table import REFERENCES
-from lagbench.scoring.score_file_checks import find_unreadable
+from lagbench.scoring.score_file_checks import read_score_file
 
 SIDE = 8
 FRAMES = 10
@@ -116,7 +116,7 @@ def test_truth_is_perfect_and_references_are_measured(
     # slices and a film of three components, which the board reads in a child
     assert card.preview.vorticity.shape == (2, 2, 4, 4)
     assert card.preview.film.shape[-1] == 3
-    assert not find_unreadable([card.files[1]])
+    read_score_file(card.files[1])
 
 
 def test_references_of_a_steady_flow_follow_it(made: LocalSplit) -> None:

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from score_bench import ScoreBench, right, still, straight
 
 from lagbench.data.registry import Measured, Registry, Size, load
-from lagbench.errors import ChecksFailedError, DataError, UsageError
+from lagbench.errors import DataError, UsageError
 from lagbench.metrics import METRICS, Score
 from lagbench.references import REFERENCES, references_of, shipped
 from lagbench.references.shipped import (
@@ -43,7 +43,6 @@ from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import (
     best_reference,
     compute_skill,
-    skill_gap,
 )
 from lagbench.scoring.tables import card_tables
 from lagbench.submission import Header
@@ -568,63 +567,3 @@ def test_persistence_has_no_skill(bench: ScoreBench, tmp_path: Path) -> None:
     assert stored.value == skill.value
     first_table = next(iter(card_tables(card)))
     assert first_table.rows[0][0].startswith("skill")
-
-
-def test_a_gap_of_skills_is_the_difference_of_their_ratios() -> None:
-    """By hand where the ratio is the same in every scenario: that gap is certain."""
-    base = [1.0, 2.0, 3.0, 4.0]
-    half = scored([0.5, 1.0, 1.5, 2.0])
-    fifth = scored([0.2, 0.4, 0.6, 0.8], first=1000)
-    gap = skill_gap([half], scored(base), [fifth], scored(base, first=1000))
-    assert (gap.first, gap.second) == pytest.approx((0.5, 0.8))
-    assert gap.value == pytest.approx(-0.3)
-    assert gap.interval == pytest.approx((-0.3, -0.3))
-
-
-def test_a_gap_to_a_perfect_prediction_is_that_of_the_other_skill() -> None:
-    """Errors of 0 are values: a perfect prediction has the skill 1."""
-    base = [1.0, 2.0, 3.0, 4.0]
-    half = scored([0.5, 1.0, 1.5, 2.0])
-    perfect = scored([0.0] * 4, first=1000)
-    gap = skill_gap([half], scored(base), [perfect], scored(base, first=1000))
-    assert (gap.first, gap.second) == pytest.approx((0.5, 1.0))
-    assert gap.interval == pytest.approx((-0.5, -0.5))
-    gap = skill_gap(
-        [perfect], scored(base, first=1000), [perfect], scored(base, first=1000)
-    )
-    assert (gap.value, gap.interval) == (0.0, (0.0, 0.0))
-
-
-def test_a_gap_over_a_perfect_naive_predictor_is_refused() -> None:
-    """Nothing is left to learn there: the skill would divide by 0."""
-    perfect = scored([0.0] * 4)
-    with pytest.raises(ChecksFailedError) as caught:
-        skill_gap([scored([1.0] * 4)], perfect, [scored([1.0] * 4)], perfect)
-    assert "0" in str(caught.value.got)
-
-
-def test_the_interval_of_a_gap_holds_the_truth() -> None:
-    """Of draws whose expected ratios are known, 95 % of the intervals hold the gap."""
-    draw = np.random.default_rng(5)
-    held = 0
-    trials = 200
-    for _ in range(trials):
-        methods = []
-        bases = []
-        for ratio, count in ((0.3, 20), (0.4, 8)):
-            base = draw.uniform(1.0, 2.0, count)
-            method = ratio * base * draw.uniform(0.5, 1.5, count)
-            methods.append([scored(method.tolist())])
-            bases.append(scored(base.tolist()))
-        gap = skill_gap(methods[0], bases[0], methods[1], bases[1])
-        held += gap.interval[0] <= 0.1 <= gap.interval[1]
-    assert 0.90 <= held / trials <= 1.0
-
-
-def test_a_gap_over_three_scenarios_has_no_interval() -> None:
-    """Without a scenario that both have there is no gap at all."""
-    base = scored([1.0, 2.0, 3.0, 4.0])
-    few = scored([1.0, 2.0, 3.0])
-    assert math.isnan(skill_gap([base], base, [few], few).interval[0])
-    with pytest.raises(ChecksFailedError):
-        skill_gap([base], scored([1.0], first=9), [few], few)

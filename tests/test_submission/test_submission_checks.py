@@ -160,16 +160,6 @@ def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
     assert flagged == [[], [pytest.approx(1.1 * limit, rel=0.01)]]
 
 
-def test_a_sound_file_opens_the_truth_once(bench: Bench) -> None:
-    """The checks need only the first frames of three scenarios: three openings."""
-    with mock.patch.object(
-        Truth, "open", autospec=True, side_effect=Truth.open
-    ) as opened:
-        result = bench.validate(bench.copy("sound.nc"))
-    assert result.exit_code == 0
-    assert [scenario for (_, scenario), _ in opened.call_args_list] == [3, 4, 5]
-
-
 def test_all_issues_are_reported_together(bench: Bench) -> None:
     """No method, a missing scenario, a NaN and a stale hash in one run, in the order of
     the checks.
