@@ -127,7 +127,6 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
         *("descending scenarios", "repeated scenarios"),
         # it would stand in for the submission itself, another's file, or count though
         # it must not
-        *("best floor submission", "best floor theirs.nc", "best floor coarse-solver"),
     ],
 )
 def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
