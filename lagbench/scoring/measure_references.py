@@ -95,7 +95,7 @@ def time_all(size: Size, root: Path, *, folder: Path = FOLDER) -> Path:
         WorkFailedError: the solver fails.
     """
     options = ["--split", size.split, "--size", size.name, "--json"]
-    command = [sys.executable, "-m", "lagbench", "bench", "solver", *options]
+    command = [sys.executable, "-m", "lagbench", "bench", *options]
     process = subprocess.run(command, capture_output=True, text=True, check=False)
     if process.returncode != 0:
         raise WorkFailedError(
