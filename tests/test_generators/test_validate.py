@@ -445,7 +445,7 @@ def test_a_bound_that_a_refusal_states_is_accepted(case: Case, grid: int) -> Non
     for name, value in wrong_settings.items():
         with pytest.raises(UsageError) as caught:
             plan(case, **options | {name: value})
-        expected = str(caught.value.expected)
+        expected = str(caught.value)
         bound = re.search(r"(?:at least|at most) ([^ ]+)", expected)
         assert bound is not None
         plan(case, **options | {name: float(bound[1])})
