@@ -40,7 +40,7 @@ TRIAL = "tiny"  # the size for trying out
 FINDING = (
     "It is not shown on any data set that learning pays.",
     "The truth and the classical rows of version 3 of the data are too weak for that. "
-    "The simulator itself, restarted from the given frames, is not among the rows: on "
+    "There the simulator, restarted from the given frames, is not among the rows: on "
     "three of the five data sets on which it was tried it has less error than the best "
     "entry at less cost (fluid mini: 0.0102 at 0.83 ms a frame, best entry 0.0245 at "
     "1.31 ms; cavity mini: 0.0085 at 4.86 ms, best entry 0.0441 at 12.4 ms; cylinder "

@@ -165,13 +165,10 @@ def board(model_board: ModelBoard, tmp_path: Path) -> Path:
     return tmp_path / "board"
 
 
-def change_weights(board: Path, suffix: str, baseline: str) -> Path:
+def change_weights(board: Path, baseline: str) -> Path:
     """Write the weights anew, with another baseline in their record."""
-    old = board / "weights/curl-noise/tiny/gns_0.safetensors"
-    checkpoint = replace(load(old), baseline=baseline)
-    old.unlink()
-    new = old.with_suffix(suffix)
-    save(new, checkpoint)
+    new = board / "weights/curl-noise/tiny/gns_0.safetensors"
+    save(new, replace(load(new), baseline=baseline))
     content = yaml.safe_load((board / PATH).read_text())
     content["predictions"][0]["weights"] = {
         "path": new.relative_to(board).as_posix(),
@@ -182,17 +179,17 @@ def change_weights(board: Path, suffix: str, baseline: str) -> Path:
 
 
 def test_weights_say_themselves_that_they_are_a_graph_network(
-    board: Path, suffix: str
+    board: Path,
 ) -> None:
     """A log beside them is not asked."""
-    path = change_weights(board, suffix, "gns")
+    path = change_weights(board, "gns")
     assert weights_of(board) == [path.relative_to(board)]
     path.with_suffix(".json").write_text(json.dumps({"baseline": "neuralmpm"}))
     assert weights_of(board) == [path.relative_to(board)]
 
 
 def test_weights_of_other_models_have_no_gates(board: Path) -> None:
-    path = change_weights(board, ".safetensors", "neuralmpm")
+    path = change_weights(board, "neuralmpm")
     path.with_suffix(".json").write_text(json.dumps({"baseline": "gns"}))
     assert weights_of(board) == []
 
