@@ -44,6 +44,23 @@ CURVE_FRAMES = 40
 """Most frames of a curve."""
 
 
+def list_data_sets(folder: Folder, registry: Registry) -> list[tuple[str, str]]:
+    """Return the (split, size) that a board shows.
+
+    They have entries; or the package has scores of their reference predictors, and the
+    board has entries of that size.
+    """
+    with_entries = folder.data_sets()
+    sizes = {size for _, size in with_entries} - {TRIAL}
+    shown = list(with_entries)
+    for split, description in registry.splits.items():
+        for size in description.sizes:
+            is_new = size in sizes and (split, size) not in shown
+            if is_new and shipped(registry.size(split, size)):
+                shown.append((split, size))
+    return shown
+
+
 def collect(
     board: str | Path,
     *,
@@ -93,7 +110,7 @@ def collect(
         shift=read_shift(folder),
         metrics=metrics,
     )
-    sizes_with_entries = {size for _, size in entries}
+    shown = list_data_sets(folder, known)
     tabs = []
     for split, description in known.splits.items():
         for name in description.sizes:
@@ -102,8 +119,8 @@ def collect(
             for entry in entries.get((split, name), ()):
                 if entry.status is Status.ACTIVE and is_current(entry.dataset, size):
                     active.append(entry)
-            is_wanted = only is None and name in sizes_with_entries and name != TRIAL
-            if active or (is_wanted and shipped(size)):
+            is_wanted = only is None or (split, name) in only
+            if active or (is_wanted and (split, name) in shown):
                 tabs.append(_make_tab(records, size, description.title, active))
     return Board(tabs=tuple(tabs))
 

@@ -15,7 +15,7 @@ from cyclopts.types import PositiveInt
 from lagbench.atomic import check_output_file
 from lagbench.board.blind import BlindScore, score_blind
 from lagbench.board.check import CheckResult, check_board
-from lagbench.board.collect import collect
+from lagbench.board.collect import collect, list_data_sets
 from lagbench.board.folder import Folder
 from lagbench.board.models import choose_data_sets
 from lagbench.board.page import build, write_picture
@@ -23,6 +23,7 @@ from lagbench.board.reproduce import TIMED_FRAMES, ReproduceResult, reproduce
 from lagbench.board.shift import scores_of_seeds
 from lagbench.board.shift_run import ShiftResult, score_on_shift
 from lagbench.board.show import tables, to_plain
+from lagbench.data.registry import load
 from lagbench.errors import UsageError, check_installed, check_regular, format_count
 from lagbench.scoring.boards import find_board
 
@@ -152,7 +153,8 @@ def picture_command(
     check_output_file(output, overwrite=overwrite)
     check_installed("vl_convert", extra="plots")
     folder = find_board(board)
-    chosen = choose_data_sets(Folder(folder).data_sets(), None, size, board=folder)
+    data_sets = list_data_sets(Folder(folder), load())
+    chosen = choose_data_sets(data_sets, None, size, board=folder)
     write_picture(collect(folder, only=chosen, metrics=()), output)
     print_line(str(output), quiet=quiet)
 
@@ -388,7 +390,7 @@ def show_command(
         metric: Metric to show; repeatable.
     """
     folder = find_board(board)
-    data_sets = Folder(folder).data_sets()
+    data_sets = list_data_sets(Folder(folder), load())
     chosen = choose_data_sets(data_sets, split, size, board=folder)
     metrics = None if as_json else metric or ()
     model = collect(folder, only=chosen, metrics=metrics)
