@@ -6,7 +6,8 @@ many particles as the size states: one of each r^d, the nearest to the places wh
 run of refinement 1 has its particles at the start. Each stands for the mass of r^d.
 
 In a full box the constants that act once a substep follow the substep: a share s that a
-particle takes over from the grid becomes s / r, so that the rate s / dt stays. The
+particle takes over from the grid becomes s / r, so that the rate s / dt stays (from r = 3
+on it is s / 3: smaller shares do not hold the noise of J). The
 mixing lengths shrink with the cells, so what the solver adds to the equations falls as
 1/r^2. On a free surface the shares stay, and it falls as 1/r: J ends at 1 there, and
 the noise that a smaller share leaves in J would push particles apart.
@@ -35,6 +36,11 @@ PER_SUBSTEP = (
 )
 """Shares of a substep of a full box, of which r are taken in place of one."""
 
+MOST_SHARED = 3
+"""Refinement from which shares stay as they are: smaller ones no longer damp the noise
+of J, and the run blows up.
+"""
+
 CANDIDATES = 16
 """Particles of the finer run among which the one nearest to a place is chosen."""
 
@@ -60,7 +66,7 @@ def refined(size: Size, times: int | None = None) -> Size:
             parameters[name] = parameters[name].model_copy(update={"value": value})
     for name in PER_SUBSTEP:
         if name in parameters and size.is_full_box:
-            value = size.value(name) / times
+            value = size.value(name) / min(times, MOST_SHARED)
             parameters[name] = parameters[name].model_copy(update={"value": value})
     return size.model_copy(update={"parameters": parameters, "subdivision": times})
 
