@@ -123,7 +123,7 @@ def test_without_a_closure_it_is_the_reference_solver() -> None:
         area=SIDE**2,
         parameters={"viscosity": VISCOSITY},
     )
-    positions = projection.predict(given, 2)
+    positions = projection.predict(given, projection.Scheme(resolution=2))
     expected = np.array(list(positions))
     model = HybridProjection.build({}, cavity_info())
     window = batch_of(path, walls, VISCOSITY)
@@ -200,7 +200,9 @@ def test_a_disc_stops_it_as_it_stops_the_reference_solver() -> None:
             "obstacle_diameter": 2.0 * disc[2],
         },
     )
-    expected = np.array(list(projection.predict(given, 2)))
+    expected = np.array(
+        list(projection.predict(given, projection.Scheme(resolution=2)))
+    )
     model = channel_model()
     assert "obstacle" in model.forcing_seen
     window = window_with_disc(path, disc)
@@ -276,7 +278,7 @@ def test_a_force_drives_it_as_it_drives_the_reference_solver() -> None:
         body_force=forces * size.frame_interval**2,
         parameters={"viscosity": VISCOSITY},
     )
-    positions = projection.predict(given, 2)
+    positions = projection.predict(given, projection.Scheme(resolution=2))
     expected = np.array(list(positions))
     model = HybridProjection.build(
         {},

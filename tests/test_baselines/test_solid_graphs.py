@@ -152,7 +152,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     paths = []
     for number, count in enumerate((125, 110, 125, 100)):
         path = folder / f"run{number}.npy"
-        np.save(path, drifting(count))
+        np.save(path, drifting(count, pace=1.0 + 0.1 * number))
         paths.append(path)
     return adopt(
         paths,

@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import Box
 from lagbench.data.registry import load
-from lagbench.references import shipped
 from lagbench.references.analog_barycentre import (
-    CHOSEN,
     MATCHED_TOGETHER,
     MeanCloud,
     follow_all,
     weights_of,
 )
 from lagbench.references.ballistic_analog import FollowedAnalog
-from lagbench.references.table import NAIVE
 from lagbench.references.train_library import mirrors_of
 
 Floats = NDArray[np.float64]
@@ -216,18 +213,3 @@ def test_all_particles_follow_each_analog() -> None:
     distances = np.array([0.1, 0.2])
     for members in follow_all(distances, 7):
         np.testing.assert_array_equal(members, np.arange(7))
-
-
-def test_it_is_the_best_naive_predictor_where_it_was_chosen() -> None:
-    """Its mean is 4 % or more below that of the other naive predictors."""
-    for key in CHOSEN:
-        split, name, _ = key.rsplit("-", 2)
-        references = shipped(load().size(split, name))
-        assert references is not None
-        means = {}
-        for reference, scores in references.items():
-            if reference in NAIVE:
-                score = scores.scores["cloud_distance"]
-                means[reference] = score.mean
-        best = means.pop("analog-barycentre")
-        assert best < 0.96 * min(means.values())

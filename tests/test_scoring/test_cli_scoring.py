@@ -112,15 +112,6 @@ def test_a_template_replaces_predictions_only_on_request(
     assert run("validate", predictions).exit_code == 0
 
 
-def test_a_template_never_replaces_a_file_of_another_kind(
-    run: Run, predictions: Path
-) -> None:
-    predictions.write_bytes(b"the work of a week")
-    arguments = ("template", SPLIT, "-o", predictions, "--overwrite")
-    assert run(*arguments).exit_code == 2
-    assert predictions.read_bytes() == b"the work of a week"
-
-
 def test_a_template_is_no_folder(run: Run, tmp_path: Path) -> None:
     result = run("template", SPLIT, "-o", tmp_path, "--overwrite")
     assert result.exit_code == 2

@@ -178,16 +178,6 @@ def change_weights(board: Path, baseline: str) -> Path:
     return new
 
 
-def test_weights_say_themselves_that_they_are_a_graph_network(
-    board: Path,
-) -> None:
-    """A log beside them is not asked."""
-    path = change_weights(board, "gns")
-    assert weights_of(board) == [path.relative_to(board)]
-    path.with_suffix(".json").write_text(json.dumps({"baseline": "neuralmpm"}))
-    assert weights_of(board) == [path.relative_to(board)]
-
-
 def test_weights_of_other_models_have_no_gates(board: Path) -> None:
     path = change_weights(board, "neuralmpm")
     path.with_suffix(".json").write_text(json.dumps({"baseline": "gns"}))

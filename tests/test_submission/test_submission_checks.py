@@ -416,9 +416,8 @@ def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:
     other = size.measured.model_copy(
         update={"scenario_sha256": dict.fromkeys(TESTS, "0" * 16)}
     )
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError):
         Truth(size.model_copy(update={"measured": other}), own.root).check()
-    assert caught.value.expected == "0" * 16
 
 
 def test_the_scorer_refuses_a_changed_truth(
