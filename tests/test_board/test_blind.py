@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import pytest
 from model_board import NAME, PATH, ModelBoard
 
@@ -16,11 +19,14 @@ from lagbench.make.generate import generate
 SEED = 64 * "5"
 
 
-def test_models_are_scored_on_new_scenarios(model_board: ModelBoard) -> None:
+def test_models_are_scored_on_new_scenarios(
+    model_board: ModelBoard, tmp_path: Path
+) -> None:
     """The draws follow from the seed; the public scores are those of the entry."""
+    shutil.copytree(model_board.root, tmp_path / "data")
     with pytest.raises(DataError):
-        score_blind(model_board.folder, [NAME], SEED, root=model_board.root)
-    root = drawn_root(model_board.root, SEED)
+        score_blind(model_board.folder, [NAME], SEED, root=tmp_path / "data")
+    root = drawn_root(tmp_path / "data", SEED)
     registry = drawn_registry(load(), "curl-noise", "tiny", SEED)
     generate("curl-noise", "tiny", root=root, registry=registry, workers=1)
     size = registry.size("curl-noise", "tiny")
@@ -28,7 +34,7 @@ def test_models_are_scored_on_new_scenarios(model_board: ModelBoard) -> None:
     with read_scenario(size.path(root, DRAWN_IDS[0])) as file:
         assert file.header.seed == ", ".join([*4 * [word], str(DRAWN_IDS[0])])
 
-    (score,) = score_blind(model_board.folder, [NAME], SEED, root=model_board.root)
+    (score,) = score_blind(model_board.folder, [NAME], SEED, root=tmp_path / "data")
     entry = read_entry(model_board.folder / PATH)
     stated = entry.score.metrics[entry.score.ranking_metric].mean
     assert score.public == pytest.approx(stated, rel=1e-6)
