@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +20,6 @@ from lagbench.baselines.rollout import roll_out
 from lagbench.data.box import Box
 from lagbench.data.registry import Size, load
 from lagbench.errors import DataError, UsageError
-from lagbench.references import projection
-from lagbench.references.predictor import Given
 from lagbench.references.staggered import StaggeredGrid
 from lagbench.tensors import TensorWindow, collate
 
@@ -107,31 +104,6 @@ def batch_of(
     return collate([window])
 
 
-def test_without_a_closure_it_is_the_reference_solver() -> None:
-    """Positions agree to the rounding of float32, with a lid that moves."""
-    size = cavity()
-    frames = size.task.input_frames + size.task.horizon
-    path = rounded(turning(size.task.input_frames))
-    walls = rounded(moving_lid(frames))
-    particle_count = path.shape[1]
-    given = Given(
-        size=size,
-        root=Path(),
-        position=path,
-        material=np.zeros(particle_count, np.int8),
-        walls=walls * size.frame_interval,
-        area=SIDE**2,
-        parameters={"viscosity": VISCOSITY},
-    )
-    positions = projection.predict(given, projection.Scheme(resolution=2))
-    expected = np.array(list(positions))
-    model = HybridProjection.build({}, cavity_info())
-    window = batch_of(path, walls, VISCOSITY)
-    (rollout,) = roll_out(model, window, size.task.horizon)
-    predicted = rollout.position.numpy()
-    np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-7)
-
-
 def channel() -> Size:
     """The description of cylinder tiny."""
     return load().size("cylinder", "tiny")
@@ -181,36 +153,6 @@ def window_with_disc(path: Array, disc: Array, viscosity: float = VISCOSITY) -> 
     return replace(window, obstacle=torch.from_numpy(disc).float()[None])
 
 
-def test_a_disc_stops_it_as_it_stops_the_reference_solver() -> None:
-    """The fringe and the stream are those of the registry; no particle enters."""
-    size = channel()
-    frames = size.task.input_frames + size.task.horizon
-    path, disc = stream_around_a_disc(size.task.input_frames)
-    given = Given(
-        size=size,
-        root=Path(),
-        position=path,
-        material=np.zeros(path.shape[1], np.int8),
-        walls=np.zeros((frames, 4, 2)),
-        area=0.5,
-        parameters={
-            "viscosity": VISCOSITY,
-            "obstacle_x": disc[0],
-            "obstacle_y": disc[1],
-            "obstacle_diameter": 2.0 * disc[2],
-        },
-    )
-    expected = np.array(
-        list(projection.predict(given, projection.Scheme(resolution=2)))
-    )
-    model = channel_model()
-    assert "obstacle" in model.forcing_seen
-    window = window_with_disc(path, disc)
-    (rollout,) = roll_out(model, window, size.task.horizon)
-    predicted = rollout.position.numpy()
-    np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-6)
-
-
 def test_a_particle_in_the_disc_is_put_on_its_surface() -> None:
     """The fluid at rest in the disc would leave it where it is."""
     path, disc = stream_around_a_disc(channel().task.input_frames)
@@ -252,51 +194,6 @@ def test_a_fit_finds_the_radius_of_a_flow_that_it_made_itself() -> None:
 
     assert numbers["error"] < 0.1 * numbers["error_without"]
     assert numbers["radius"] == pytest.approx(0.33, abs=0.03)
-
-
-def test_a_force_drives_it_as_it_drives_the_reference_solver() -> None:
-    """Two layers of a periodic square are pushed opposite ways, harder each frame."""
-    size = load().size("poiseuille", "tiny")
-    given_frames = size.task.input_frames
-    frames = given_frames + size.task.horizon
-    axis = (np.arange(24) + 0.5) / 24
-    columns, rows = np.meshgrid(axis, axis, indexing="ij")
-    place = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    path = rounded(np.repeat(place[None], given_frames, axis=0))
-    forces = np.zeros((frames, 2, 2))
-    strength = 0.01 * np.arange(frames)
-    forces[:, 0, 0] = strength
-    forces[:, 1, 0] = -strength
-    forces = rounded(forces)
-    given = Given(
-        size=size,
-        root=Path(),
-        position=path,
-        material=np.zeros(len(place), np.int8),
-        walls=np.zeros((frames, 4, 2)),
-        area=1.0,
-        body_force=forces * size.frame_interval**2,
-        parameters={"viscosity": VISCOSITY},
-    )
-    positions = projection.predict(given, projection.Scheme(resolution=2))
-    expected = np.array(list(positions))
-    model = HybridProjection.build(
-        {},
-        info(
-            bounds=size.bounds,
-            periodic=("x", "y"),
-            frame_interval=size.frame_interval,
-            score_cells=size.task.score_grid.cells,
-            input_frames=given_frames,
-        ),
-    )
-    window = batch_of(path, None, VISCOSITY)
-    body_force = torch.from_numpy(forces).float()
-    window = replace(window, body_force=body_force[None])
-    (rollout,) = roll_out(model, window, size.task.horizon)
-    predicted = rollout.position.numpy()
-    np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-7)
-    assert np.abs(expected[-1] - path[-1]).max() > 0.01
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
