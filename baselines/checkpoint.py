@@ -67,7 +67,8 @@ class Checkpoint:
     @property
     def recipe(self) -> Mapping[str, Any]:
         """Recipe of the training, plain values."""
-        return self.training.get("recipe", {})
+        recipe: Mapping[str, Any] = self.training.get("recipe", {})
+        return recipe
 
     @property
     def seed(self) -> int:

@@ -211,7 +211,8 @@ def test_graph_network_step(monkeypatch: pytest.MonkeyPatch) -> None:
         def step() -> None:
             output, _ = model(node, edge_index, edge, generator)
             optimizer.zero_grad()
-            nn.functional.mse_loss(output, target).backward()
+            loss = nn.functional.mse_loss(output, target)
+            loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
 
         step()

@@ -235,7 +235,7 @@ class OnnxModel:
         self, given: dict[str, NDArray[Any]], window: NDArray[np.float64], done: int
     ) -> NDArray[np.float64]:
         """Return the next frames, at least one, shape [frame, particle, axis]."""
-        values = {}
+        values: dict[str, NDArray[Any]] = {}
         for name, dtype in self._types.items():
             if name == "position":
                 value: NDArray[Any] = window

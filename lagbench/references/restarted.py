@@ -278,13 +278,14 @@ class ParticleRestart(Restart):
             self._parent = np.repeat(np.arange(count), len(offsets))
             self._offset = np.tile(offsets, (count, 1))
             # each particle keeps its offset to a part of its own that is drawn
-            draws = np.random.Generator(np.random.PCG64(0)).random(count)
+            source = np.random.Generator(np.random.PCG64(0))
+            draws = source.random((count,))
             chosen = (draws * len(offsets)).astype(np.intp)
             self._leader = np.arange(count) * len(offsets) + chosen
             self._carriers = np.zeros(0, np.intp)
             self._others = np.arange(count)
             return len(self._parent)
-        carried = min(count, round(count * refinement**dimension))
+        carried = min(count, int(round(count * float(refinement**dimension))))
         self._carriers = spread_subset(given.last, given.material, carried)
         self._parent = self._carriers
         self._offset = np.zeros((carried, dimension))
@@ -412,7 +413,8 @@ def local_fit(
     box = given.box
     tree = box.tree(position)
     neighbour_count = min(NEAREST, len(position))
-    distance, nearest = tree.query(box.tree_points(at), k=neighbour_count)
+    found = tree.query(box.tree_points(at), k=neighbour_count)
+    distance, nearest = map(np.asarray, found)
     weight = 1.0 / (distance**2 + 1e-6 * distance[:, -1:] ** 2)
     way = box.displacement(at[:, None], position[nearest])
     one = np.ones((*way.shape[:2], 1))
@@ -441,7 +443,7 @@ def _obstacle_of(given: Given, resolution: Resolution) -> Obstacle | None:
     radius = float(given.obstacle[-1])
     spacing = 1.0 / (float(given.size.value("lattice")) * resolution.refinement)
     most = math.ceil(radius / spacing)
-    steps = spacing * (np.arange(-most, most) + 0.5)
+    steps: Floats = spacing * (np.arange(-most, most, dtype=np.float64) + 0.5)
     ways = _lattice([steps] * given.box.dimension)
     is_inside = (ways**2).sum(axis=1) < radius**2
     return Obstacle(

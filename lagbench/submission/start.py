@@ -128,7 +128,8 @@ def check_shift(predictions: Predictions, truth: Truth, issues: IssueCollector) 
     shifts = set()
     for scenario in sorted(scored) if count > 1 else ():
         predicted = predictions.frames(scenario, first, count).astype(np.float64)
-        true_frames = truth.frames(scenario, first - 1, first + count + 1)
+        recorded = truth.frames(scenario, first - 1, first + count + 1)
+        true_frames = recorded.astype(np.float64)
         shift = 0
         if np.isfinite(predicted).all():
             shift = find_shift(predicted, true_frames, truth.size.box)
