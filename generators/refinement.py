@@ -8,8 +8,9 @@ run of refinement 1 has its particles at the start. Each stands for the mass of 
 In a full box the constants that act once a substep follow the substep: a share s that a
 particle takes over from the grid becomes s / r, so that the rate s / dt stays. From
 r = 3 on it is s / 3: smaller shares do not hold the noise of J. The mixing lengths
-shrink with the cells, so what the solver adds to the equations falls as 1/r^2. On a free surface the shares stay, and it falls as 1/r: J ends at 1 there, and
-the noise that a smaller share leaves in J would push particles apart.
+shrink with the cells, so what the solver adds to the equations falls as 1/r^2. On a
+free surface the shares stay, and it falls as 1/r: J ends at 1 there, and the noise that
+a smaller share leaves in J would push particles apart.
 """
 
 from __future__ import annotations

@@ -285,7 +285,7 @@ class ParticleRestart(Restart):
             self._carriers = np.zeros(0, np.intp)
             self._others = np.arange(count)
             return len(self._parent)
-        carried = min(count, int(round(count * float(refinement**dimension))))
+        carried: int = min(count, round(count * float(refinement**dimension)))
         self._carriers = spread_subset(given.last, given.material, carried)
         self._parent = self._carriers
         self._offset = np.zeros((carried, dimension))
