@@ -197,7 +197,7 @@ def test_a_training_and_its_predictions_go_through_the_ends(
     with open_predictions(path) as predictions:
         prediction = predictions.frames(3, 11, 1)
     last = prediction[0].astype(np.float64)
-    truth = drifting(100)[-1].astype(np.float64)
+    truth = drifting(100, pace=1.3)[-1].astype(np.float64)
     box = locate(made.folder).size.box
     error = box.displacement(truth, last)
     assert np.abs(error).max() < 0.01
