@@ -229,7 +229,7 @@ def _draw_pour(name: str, number: int, rng: np.random.Generator) -> Task:
         shape = Rectangle.of_area(area, uniform(rng, 0.6, 1.7))
     left = uniform(rng, 0.45, 0.75)
     bucket = np.array([(left, left + 0.2), (0.0, 0.35)])
-    frames = 60 + int(40 * rng.random())
+    frames = 36 + int(24 * rng.random())
     shift_seed = int(rng.random() * 2**32)
     goal = (
         f"the liquid lies between x = {left:.3f} and {left + 0.2:.3f}, below y = 0.35, "
@@ -268,7 +268,7 @@ def _draw_pour(name: str, number: int, rng: np.random.Generator) -> Task:
         parameters=(
             Parameter("x", "length", 0.08 + reach_x, 0.42),
             Parameter("y", "length", 0.08 + reach_y, 0.6),
-            Parameter("speed", "length/s", 0.0, 2.0),
+            Parameter("speed", "length/s", 0.0, 2.5),
             Parameter("angle", "degree", -30.0, 80.0),
         ),
         frames=frames,

@@ -556,12 +556,14 @@ def _show_particles(axes: Axes, subject: Subject, snapshot: Snapshot) -> None:
     position = np.asarray(snapshot.position, np.float64)
     colours = np.array(MATERIAL_COLOURS)[snapshot.scenario.material]
     if position.shape[1] == 2:
-        axes.scatter(*position.T, s=1.5, c=colours, lw=0)
+        x, y = position.T
+        axes.scatter(x, y, s=1.5, c=colours, lw=0)
         _frame_panel(axes, subject)
         return
     view = View(subject.task.config.box)
     order = np.argsort(-view.depth(position), kind="stable")
-    axes.scatter(*view.place(position[order]).T, s=0.8, c=colours[order], lw=0)
+    x, y = view.place(position[order]).T
+    axes.scatter(x, y, s=0.8, c=colours[order], lw=0)
     for ends, _ in view.edges():
         axes.plot(*ends.T, color=WALL, lw=0.6)
     axes.set(xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[], aspect="equal")
