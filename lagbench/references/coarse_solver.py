@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size
 from lagbench.errors import check_installed
 from lagbench.generators.constants import solver_constants
-from lagbench.generators.solver import Solver, build
-from lagbench.generators.split import InitialState, SolverParameters
+from lagbench.generators.split import InitialState
 
 from .predictor import (
     Floats,
@@ -40,6 +39,7 @@ from .predictor import (
     velocity_field,
     with_wall_images,
 )
+from .restarted import borrow_solver, give_back, leaders, spread_subset
 from .train_library import UP
 
 MIN_CELLS = 16
@@ -125,13 +125,13 @@ class CoarseRollout:
         self.before = self.position[self.carriers]  # where they were a frame ago
         all_particles = np.arange(len(self.position))
         self.others = np.setdiff1d(all_particles, self.carriers)
-        self.leader = _leaders(given, self.carriers, self.others)
+        self.leader = leaders(given, self.carriers, self.others)
         self.offset = given.box.displacement(
             self.position[self.carriers][self.leader], self.position[self.others]
         )
         constants = replace(solver_constants(coarse), particles=count)
-        self.solver = _borrow_solver(constants)
-        weakref.finalize(self, _give_back, constants, self.solver)
+        self.solver = borrow_solver(constants)
+        weakref.finalize(self, give_back, constants, self.solver)
         self.solver.load([_state(given, self.carriers)])
 
     def advance(self) -> Floats:
@@ -165,86 +165,6 @@ class CoarseRollout:
         return self.position
 
 
-MOST_KEPT = 4
-"""Sets of constants of which free solvers are kept, at most."""
-
-_idle_solvers: dict[SolverParameters, list[Solver]] = {}
-"""Free solvers by their constants, last used ones last: to build one compiles it."""
-
-
-def _borrow_solver(constants: SolverParameters) -> Solver:
-    """Return a solver that no other rollout uses."""
-    idle = _idle_solvers.get(constants)
-    if idle:
-        return idle.pop()
-    return build(constants, threads=1)
-
-
-def _give_back(constants: SolverParameters, solver: Solver) -> None:
-    """Keep a solver for the next rollout; where there are many, the oldest go."""
-    idle = _idle_solvers.pop(constants, [])
-    idle.append(solver)
-    _idle_solvers[constants] = idle
-    while len(_idle_solvers) > MOST_KEPT:
-        oldest = next(iter(_idle_solvers))
-        del _idle_solvers[oldest]
-
-
-def spread_subset(
-    position: Floats, material: NDArray[np.integer], count: int
-) -> NDArray[np.intp]:
-    """Return which particles carry the mass: one, drawn, of each group of neighbours.
-
-    Groups follow material, column and height. A material with fewer particles than a
-    group may get none.
-    """
-    order = _order_of_columns(position, material, count)
-    draws = np.random.Generator(np.random.PCG64(0)).random(count)
-    groups = np.array_split(order, count)
-    carriers = []
-    for draw, group in zip(draws, groups, strict=True):
-        place = int(draw * len(group))
-        carriers.append(group[place])
-    return np.sort(carriers)
-
-
-def _order_of_columns(
-    position: Floats, material: NDArray[np.integer], count: int
-) -> NDArray[np.intp]:
-    """Return the particles of each material column by column, along the last axis.
-
-    In three dimensions a slab across x holds columns across y.
-    """
-    particles, dimension = position.shape
-    x = position[:, 0]
-    y = position[:, 1]
-    column = np.zeros(particles, np.intp)
-    for kind in np.unique(material):
-        members = np.flatnonzero(material == kind)
-        chosen_count = math.ceil(count * len(members) / particles)
-        if dimension == 2:
-            columns = math.isqrt(chosen_count)
-            column[members] = _rank(x[members], columns)
-            continue
-        root = float(np.cbrt(chosen_count))
-        side = max(1, round(root))
-        slab = _rank(x[members], side)
-        for number in range(side):
-            inside = members[slab == number]
-            column_of_slab = _rank(y[inside], side)
-            column[inside] = number * side + column_of_slab
-    last_axis = position[:, -1]
-    return np.lexsort((last_axis, column, material))
-
-
-def _rank(coordinate: Floats, groups: int) -> NDArray[np.intp]:
-    """Return in which of so many groups of nearly equal counts each one lies."""
-    order = np.argsort(coordinate, kind="stable")
-    place = np.argsort(order, kind="stable")
-    count = max(1, len(coordinate))
-    return np.asarray(place * groups // count, np.intp)
-
-
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
     """Return the start of the solver: the particles that carry mass."""
     size = given.size
@@ -275,29 +195,6 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
         friction=float(str(friction)),
         wall_velocity=wall_velocity,
     )
-
-
-def _leaders(
-    given: Given, carriers: NDArray[np.intp], others: NDArray[np.intp]
-) -> NDArray[np.intp]:
-    """Return for each other particle the index of the nearest of its material that
-    carries mass; of any material where none of its own does.
-    """
-    carrier_position = given.last[carriers]
-    carrier_material = given.material[carriers]
-    other_position = given.last[others]
-    other_material = given.material[others]
-    leader = np.zeros(len(others), np.intp)
-    for kind in np.unique(other_material):
-        pool = np.flatnonzero(carrier_material == kind)
-        if not pool.size:
-            pool = np.arange(len(carriers))
-        led = np.flatnonzero(other_material == kind)
-        tree = given.box.tree(carrier_position[pool])
-        points = given.box.tree_points(other_position[led])
-        _, nearest = tree.query(points)
-        leader[led] = pool[nearest]
-    return leader
 
 
 TWO_THIRDS = Fraction(3, 2)

@@ -178,8 +178,8 @@ class Restart(ABC):
             counts["obstacle_particles"] = len(self._obstacle.position)
         constants = replace(resolution.constants, **counts)
         self._substeps = round(given.size.frame_interval / constants.dt)
-        self._solver = _borrow_solver(constants)
-        weakref.finalize(self, _give_back, constants, self._solver)
+        self._solver = borrow_solver(constants)
+        weakref.finalize(self, give_back, constants, self._solver)
         self._run_through_given_frames()
         self._before = self._solver_position()  # of the solver's particles
 
@@ -290,7 +290,7 @@ class ParticleRestart(Restart):
         self._parent = self._carriers
         self._offset = np.zeros((carried, dimension))
         self._others = np.setdiff1d(np.arange(count), self._carriers)
-        self._leader = _leaders(given, self._carriers, self._others)
+        self._leader = leaders(given, self._carriers, self._others)
         return carried
 
     def _run_through_given_frames(self) -> None:
@@ -453,7 +453,7 @@ def _obstacle_of(given: Given, resolution: Resolution) -> Obstacle | None:
     )
 
 
-def _leaders(
+def leaders(
     given: Given, carriers: NDArray[np.intp], others: NDArray[np.intp]
 ) -> NDArray[np.intp]:
     """Return for each other particle the index of the nearest of its material that
@@ -483,7 +483,7 @@ _idle_solvers: dict[SolverParameters, list[Solver]] = {}
 """Free solvers by their constants, last used ones last: to build one compiles it."""
 
 
-def _borrow_solver(constants: SolverParameters) -> Solver:
+def borrow_solver(constants: SolverParameters) -> Solver:
     """Return a solver that no other rollout uses."""
     idle = _idle_solvers.get(constants)
     if idle:
@@ -491,7 +491,7 @@ def _borrow_solver(constants: SolverParameters) -> Solver:
     return build(constants, threads=1)
 
 
-def _give_back(constants: SolverParameters, solver: Solver) -> None:
+def give_back(constants: SolverParameters, solver: Solver) -> None:
     """Keep a solver for the next rollout; where there are many, the oldest go."""
     idle = _idle_solvers.pop(constants, [])
     idle.append(solver)
