@@ -49,7 +49,8 @@ FINDING = (
     "is a fair trade, a network is not. The hybrids fit three to five numbers, so they "
     "are calibrated solvers. On cavity mini a converged solution of the stated "
     "equations has an error of 0.062 against the truth, more than the best entry: "
-    "smaller differences mean nothing. Version 4 of the data mends both.",
+    "smaller differences mean nothing. Of the data sets with a finer truth, fluid mini "
+    "and curl-noise mini, none has a network yet.",
 )
 """What is said while no data set is judged."""
 
