@@ -34,7 +34,7 @@ from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Entry, Status, data_set_of, is_current, read_entry
 from .folder import Folder
-from .gates import gates_failed_by, read_failed_gates
+from .gates import EARLY_ERROR, gates_failed_by, read_failed_gates, with_early_gate
 from .ranking import combine
 from .rows import TRIAL, Board, Curve, Row, Tab, Value
 from .shift import SUBSET, ShiftScores, read_shift, scores_of_seeds, shift_of
@@ -184,6 +184,7 @@ def _make_tab(
             )
             rows.append(row)
 
+    rows = with_early_gate(rows, records.failed_gates)
     rows.sort(key=lambda row: (mean_loss(row.seeds), row.id))
     tab = Tab(
         size=size,
@@ -272,7 +273,7 @@ def _read_row(
     ranking = ranking_metric(size)
     names = None
     if records.metrics is not None:
-        names = {*records.metrics, ranking}
+        names = {*records.metrics, ranking, EARLY_ERROR}
     stored = []
     for path in entry.score_paths:
         stored.append(read_score_file(records.folder.path / path, size).scores)

@@ -1,17 +1,27 @@
-"""The gates of trained weights, leaderboard/gates.json: which weights failed which.
+"""The gates of graph networks: what their weights must do to support a claim.
 
-``python -m studies.gates`` measures them; docs/baselines.md says what they are.
+``python -m studies.gates`` measures the gates of single steps and short rollouts, and
+leaderboard/gates.json holds which weights failed which. The error after twenty frames
+is in the scores. docs/baselines.md says what the gates are.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
 
 from lagbench.errors import UnreadableFileError
 
 from .entry import Entry
 from .folder import GATES, Folder
+from .rows import Row
+
+EARLY_ERROR = "position_rmse_20"
+EARLY_GATE = "twenty_frames"
+YARDSTICK = "neuralmpm"
+MOST_EARLY_ERROR = 3.0
+"""Error of the first twenty frames that a graph network may have, over NeuralMPM's."""
 
 
 def read_failed_gates(folder: Folder) -> Mapping[str, tuple[str, ...]]:
@@ -45,3 +55,30 @@ def gates_failed_by(
         if prediction.weights is not None:
             names.update(dict.fromkeys(failed.get(prediction.weights.sha256, ())))
     return tuple(names)
+
+
+def with_early_gate(rows: Sequence[Row], measured: Container[str]) -> list[Row]:
+    """Return the rows of a data set with the gate of twenty frames.
+
+    Args:
+        rows: all rows.
+        measured: SHA-256 of all weights that have gates; they are graph networks.
+    """
+    errors = {}
+    for row in rows:
+        if EARLY_ERROR in row.metrics:  # not where the horizon is shorter
+            errors[row.id] = row.metrics[EARLY_ERROR].mean
+    if YARDSTICK not in errors:
+        return list(rows)
+
+    limit = MOST_EARLY_ERROR * errors[YARDSTICK]
+    judged = []
+    for row in rows:
+        is_graph_network = row.entry is not None and any(
+            one.weights is not None and one.weights.sha256 in measured
+            for one in row.entry.predictions
+        )
+        if is_graph_network and errors[row.id] > limit:
+            row = replace(row, failed_gates=(*row.failed_gates, EARLY_GATE))
+        judged.append(row)
+    return judged

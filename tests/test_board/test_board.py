@@ -25,10 +25,11 @@ from command_line import CliRunner
 
 from lagbench.board.check import check_board
 from lagbench.board.collect import _rank, collect
-from lagbench.board.entry import Entry, entry_bytes, read_entry, validate
+from lagbench.board.entry import Entry, Weights, entry_bytes, read_entry, validate
 from lagbench.board.folder import Folder
+from lagbench.board.gates import EARLY_ERROR, with_early_gate
 from lagbench.board.page import build, cost_chart, render, write_picture
-from lagbench.board.rows import Board, Tab
+from lagbench.board.rows import Board, Row, Tab, Value
 from lagbench.board.show import to_plain
 from lagbench.board.verified import Level, read_verified
 from lagbench.cli.program import app
@@ -342,3 +343,26 @@ def test_commands_refuse_what_is_not_there(
 ) -> None:
     words = ["leaderboard", *arguments, "--board", str(bench.folder)]
     assert CliRunner().invoke(app, words).exit_code == exit_code
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"), [(0.3, ()), (0.301, ("twenty_frames",))]
+)
+def test_a_graph_network_has_at_most_three_times_the_early_error_of_neuralmpm(
+    error: float, expected: tuple[str, ...], tab: Tab
+) -> None:
+    some = next(row for row in tab.rows if row.entry is not None)
+    assert some.entry is not None
+    weights = Weights(path="weights/cavity/tiny/gns_0.safetensors", sha256=64 * "0")
+    (first, *_) = some.entry.predictions
+    prediction = first.model_copy(update={"weights": weights})
+    entry = some.entry.model_copy(update={"predictions": (prediction,)})
+
+    def row(name: str, error: float) -> Row:
+        return replace(
+            some, id=name, entry=entry, metrics={EARLY_ERROR: Value(mean=error)}
+        )
+
+    rows = [row("neuralmpm", 0.1), row("gns", error)]
+    judged = with_early_gate(rows, [weights.sha256])
+    assert [one.failed_gates for one in judged] == [(), expected]

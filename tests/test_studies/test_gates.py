@@ -90,7 +90,7 @@ GATES = Gates(
     dataset_version="3.0.0",
     method="gns_0",
     weights_sha256="",
-    one_step=1.0,
+    one_step=0.5,
     free_flight=-0.4,
     settled=None,
     densest_cell=2.9,
@@ -116,10 +116,10 @@ def test_what_is_recorded_of_other_weights_stays(tmp_path: Path) -> None:
     path = tmp_path / "gates.json"
     assert read_recorded(path) == []
     path.write_text(to_json([GATES, replace(GATES, method="gns_1")]))
-    better = replace(GATES, one_step=0.5)
+    better = replace(GATES, one_step=0.25)
     path.write_text(to_json([better], recorded=read_recorded(path)))
     first, second = read_recorded(path)
-    assert first["one_step"] == 0.5
+    assert first["one_step"] == 0.25
     assert second["method"] == "gns_1"
 
 
