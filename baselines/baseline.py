@@ -16,7 +16,7 @@ from itertools import compress
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 
 from lagbench.data.box import AXES, Box, parse_periodic
@@ -50,10 +50,24 @@ class Options(Settings):
             of them.
         of_weights: names of options that say what weights mean where the shapes of the
             weights do not. A trained model refuses changes of them too.
+        retired: options that weights of earlier versions state, with the value that
+            each of them had where it did nothing.
     """
 
     in_training: ClassVar[frozenset[str]] = frozenset()
     of_weights: ClassVar[frozenset[str]] = frozenset()
+    retired: ClassVar[Mapping[str, object]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_retired(cls, values: object) -> object:
+        if not isinstance(values, Mapping):
+            return values
+        return {
+            name: value
+            for name, value in values.items()
+            if cls.retired.get(name, ...) != value
+        }
 
 
 class Baseline(nn.Module):

@@ -9,28 +9,21 @@ the grid, of a material or of all together. Damping acts only on the difference 
 the velocity of a particle and u, so that rollouts keep their energy. The accelerations
 of a node are those of the matter around it in frame f, wherever that moves in the
 bundle: one transfer each way serves all frames of a call. Training unrolls several
-calls. The U-Net's last layer starts at zero: an untrained model keeps every velocity,
-but for the projections.
-
-The parts are files of their own: the U-Net's input
-(:mod:`~lagbench.baselines.neuralmpm_fields`), the meaning of its output
-(:mod:`~lagbench.baselines.neuralmpm_accelerations`), and the corrections of positions
-with ``shape`` and ``density`` (:mod:`~lagbench.baselines.projection`).
+calls. The U-Net's last layer starts at zero: an untrained model keeps every velocity.
+:mod:`~lagbench.baselines.neuralmpm_fields` makes the U-Net's input.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lagbench.errors import DataError
 
 from .augmentation import (
-    Symmetry,
     augment,
     mirror_field,
     mirror_matrices,
@@ -40,16 +33,9 @@ from .augmentation import (
 from .baseline import Baseline, Batch, DatasetInfo, last_velocities
 from .deviations import root_mean_square
 from .forcing import require_force, skip_frames
-from .free_flight import FALL_UNIT
-from .neuralmpm_accelerations import (
-    Accelerations,
-    FieldAccelerations,
-    StressAccelerations,
-)
 from .neuralmpm_fields import FieldEncoder, GridState
 from .neuralmpm_options import NeuralMPMOptions, check_options
 from .particle_grid import ParticleGrid
-from .projection import Projection
 from .strain import RestShape, first_frame
 from .unet import NODES_PER_COARSE_NODE, ContextNetwork, UNet
 
@@ -94,16 +80,6 @@ class NeuralMPM(Baseline):
             velocity_std=self.velocity_std,
             acceleration_std=self.acceleration_std,
         )
-        self.decoder: Accelerations
-        if options.conserve:
-            self.decoder = StressAccelerations(
-                self.grid, options, weight_unit=weight_unit
-            )
-        else:
-            self.decoder = FieldAccelerations(
-                self.grid, options, weight_unit=weight_unit
-            )
-
         self.context: ContextNetwork | None = None
         if options.context:
             self.context = ContextNetwork(
@@ -115,17 +91,10 @@ class NeuralMPM(Baseline):
             + options.context
             + options.viscosity
         )
-        self.network = UNet(inputs, self.decoder.channels, options.width, periodic)
-        # Stresses conserve momentum, so gravity needs a weight of its own. Where all
-        # mirror images of the square are equally likely, there is no gravity.
-        self.fall: nn.Parameter | None = None
-        if options.conserve and options.symmetry is not Symmetry.SQUARE:
-            self.fall = nn.Parameter(torch.zeros(()))
-        self.projection: Projection | None = None
-        if options.shape or options.density:
-            self.projection = Projection(
-                info.bounds, shape=options.shape, density=options.density
-            )
+        # vectors at a node: an acceleration of each material in each frame
+        self.output_vectors = len(options.materials) * options.bundle
+        outputs = info.box.dimension * self.output_vectors
+        self.network = UNet(inputs, outputs, options.width, periodic)
 
     @property
     def history(self) -> int:
@@ -141,19 +110,7 @@ class NeuralMPM(Baseline):
     @property
     def origin(self) -> bool:
         """Whether the model compares bodies with the scenario's first frame."""
-        return self.options.strain or self.projection is not None
-
-    def adapt_weights(
-        self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
-    ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Return weights for the grids of this model's projections.
-
-        Grids that stand first in both models keep their weights, others start anew.
-        """
-        projection = self.projection
-        if projection is None:
-            projection = Projection(self.info.bounds, shape=(), density=())
-        return projection.adapt_weights(weights, options, prefix="projection.")
+        return self.options.strain
 
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
@@ -230,14 +187,6 @@ class NeuralMPM(Baseline):
             body_force=self._coming_force(given),
             rest_shape=self._rest_shape(given, layer),
         )
-        if self.projection is not None:
-            projection = self.projection.start(
-                first_frame(given),
-                given.material,
-                given.sample,
-                given.windows,
-            )
-            state = replace(state, projection=projection)
         if self.context is not None:
             context = self._encode_context(state, self.context, average=average)
             state = replace(state, context=context)
@@ -350,26 +299,16 @@ class NeuralMPM(Baseline):
         else:
             output = self.network(inputs)
 
+        # One transfer serves the velocity and the accelerations of all frames.
+        axes = self.grid.dimension
         output = output * self.acceleration_std
-        gathered_velocity, accelerations = self.decoder.decode(
-            state, stencil, output, grid_velocity
-        )
-        # A learned number beside the output, since stresses alone conserve momentum.
-        if self.fall is not None:
-            accelerations = self._add_fall(accelerations, self.fall)
-        frames = self._integrate(state, gathered_velocity, accelerations)
-        next_state = self._after(state, frames)
-        return next_state, frames
-
-    def _add_fall(
-        self, accelerations: Sequence[Tensor], fall: Tensor
-    ) -> Sequence[Tensor]:
-        """Return the accelerations of all frames with the fall g."""
-        unit = FALL_UNIT * self.acceleration_std  # [length/frame^2]
-        direction = torch.stack([0.0 * fall, fall])
-        without_fall = torch.stack(list(accelerations), dim=1)
-        with_fall = without_fall + unit * direction
-        return with_fall.unbind(dim=1)
+        of_layers = output.reshape(-1, axes * self.options.bundle, *self.grid.shape)
+        field = torch.cat([grid_velocity, of_layers], dim=1)
+        gathered = self.grid.gather(stencil, field)
+        gathered = gathered.view(len(stencil.weight), -1, axes)
+        velocity_around, *accelerations = gathered.unbind(dim=1)
+        frames = self._integrate(state, velocity_around, accelerations)
+        return self._after(state, frames), frames
 
     def _mirror_matrices(self) -> Tensor:
         """Return the matrices of all mirror images, shape [image, axis, axis]."""
@@ -411,7 +350,7 @@ class NeuralMPM(Baseline):
             image = mirror_field(inputs, matrix, input_blocks)
             image_output = self.network(image)
             inverse = matrix.T
-            output_blocks = self.decoder.mirror(inverse)
+            output_blocks = [inverse] * self.output_vectors
             output = mirror_field(image_output, inverse, output_blocks)
             outputs.append(output)
         of_images = torch.stack(outputs)
@@ -438,10 +377,6 @@ class NeuralMPM(Baseline):
             own_velocity = (1.0 - smoothing) * velocity
             smooth_velocity = smoothing * grid_velocity
             velocity = own_velocity + smooth_velocity + acceleration
-            if self.projection is not None and state.projection is not None:
-                moved = position + velocity
-                corrected = self.projection(state.projection, moved)
-                velocity = self.box.displacement(position, corrected)
             velocity = self.box.stop_at_walls(position, velocity)
             moved = position + velocity
             # The sum may round to a number beyond the wall.

@@ -19,7 +19,6 @@ from .augmentation import strain_matrix, wall_permutation
 from .graph import MATERIALS
 from .neuralmpm_options import NeuralMPMOptions
 from .particle_grid import ParticleGrid, Stencil
-from .projection import ProjectionState
 from .strain import RestShape
 
 # below this weight, in units of particles a radius apart, a node's velocity fades to 0
@@ -49,7 +48,6 @@ class GridState:
     # frame, layer, axis]; None where the U-Net does not see it
     body_force: Tensor | None = None
     rest_shape: RestShape | None = None  # None where strain is not asked for
-    projection: ProjectionState | None = None  # None without a projection
     coming: tuple[Tensor, ...] = ()  # predicted positions of the frames to come
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import ClassVar
 
 from pydantic import Field
 
@@ -12,16 +13,16 @@ from .augmentation import Symmetry
 from .baseline import DatasetInfo, Options, check_moving_walls
 from .graph import MATERIALS
 
-GridCells = Annotated[int, Field(ge=2, le=256)]
-Grids = Annotated[tuple[GridCells, ...], Field(max_length=8)]
-
 
 class NeuralMPMOptions(Options):
     """Options of the grid surrogate."""
 
     in_training = frozenset({"calls", "pushforward", "recovery", "noise_std", "shift"})
-    # the weights of projections are of these grids, in this order
-    of_weights = frozenset({"shape", "density"})
+    retired: ClassVar[Mapping[str, object]] = {
+        "conserve": False,
+        "shape": [],
+        "density": [],
+    }
 
     # cells of the network's grid across the box; even, so that walls lie between two
     # nodes on all sides; along a periodic axis the nearest multiple of 4
@@ -55,15 +56,8 @@ class NeuralMPMOptions(Options):
     # whether particles are damped towards the velocity of all materials together, as if
     # one grid carried them all
     mixture: bool = False
-    # whether the U-Net predicts stresses, and accelerations beside walls only: momentum
-    # is conserved everywhere else
-    conserve: bool = False
     # whether the U-Net sees the strain of solids since the scenario's first frame
     strain: bool = False
-    # cells across the box of the grids of shape matching, in turn
-    shape: Grids = ()
-    # cells across the box of the grids of density projection, in turn
-    density: Grids = ()
     # training windows are replaced by random ones of these mirror images
     symmetry: Symmetry = Symmetry.NONE
     # training windows are moved by random ways along periodic axes, if there are any:
@@ -80,17 +74,14 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
     Raises:
         UsageError: no material is named, or one is unknown or named twice; `average` is
             set and there are no mirror images; `wall_velocity` is set and no wall
-            moves; or an option needs a two-dimensional box without periodic axes, and
-            the box is another one.
+            moves; or `strain` is set and the box has a periodic axis or a third one.
     """
     check_moving_walls(options.wall_velocity, info)
-    # These options need a square box with walls on all four sides.
-    if info.box.dimension != 2 or info.box.is_periodic:
-        for name in ("conserve", "strain", "shape", "density"):
-            if getattr(options, name):
-                raise UsageError(
-                    f"model.{name} needs a two-dimensional box without periodic axes"
-                )
+    has_four_walls = info.box.dimension == 2 and not info.box.is_periodic
+    if options.strain and not has_four_walls:
+        raise UsageError(
+            "model.strain needs a two-dimensional box without periodic axes"
+        )
     materials = set(options.materials)
     is_repeated = len(materials) < len(options.materials)
     if not materials or is_repeated or not materials <= set(range(MATERIALS)):

@@ -23,7 +23,7 @@ from lagbench.data.box import AXES, Box
 from lagbench.tensors import TensorBox
 
 from .graph import Bounds, wall_distance
-from .torch_grid import number_nodes, spline_slopes, spline_weights, three_places
+from .torch_grid import number_nodes, spline_weights, three_places
 
 __all__ = ["ParticleGrid", "Stencil"]
 
@@ -258,60 +258,6 @@ class ParticleGrid(nn.Module):
         weighted = weight[:, :, None] * nearby
         return weighted.sum(dim=1)
 
-    def accelerate(
-        self,
-        stencil: Stencil,
-        position: Tensor,
-        stress: Tensor,
-        mass: Tensor,
-    ) -> Tensor:
-        """Return accelerations (x, y) of nodes of matter under stress.
-
-            m_i a_i = -sum_p s_p grad b_i(x_p),   m_i = sum_p b_i(x_p)
-
-        This is the weak form of the material-point method (Sulsky, Chen and Schreyer
-        1994). Every particle has mass 1, and grad counts in cells; a is 0 where there
-        is no matter. As sum b_i = 1 and sum b_i x_i = x at every particle, and the s_p
-        are symmetric, momentum and angular momentum of the nodes are conserved. The
-        result has shape [layer, 2 frame, x node, y node]; x and y of a frame are
-        neighbours.
-
-        The box has two dimensions and walls.
-
-        Args:
-            stencil: nodes around ``position``.
-            position: positions [length], shape [particle, 2].
-            stress: s_p, the stress times the volume of a particle of mass 1, as
-                components (xx, xy, yy) [length cell/frame^2], shape [particle, frame,
-                3].
-            mass: result of :meth:`spread` for values of 1.
-        """
-        columns, rows = self.shape
-        _, offset = self._locate(position)
-        slopes = spline_slopes(offset)
-        slopes = slopes.flatten(2)  # [particle, 2, 9]
-        slope_x, slope_y = slopes[..., None].unbind(dim=1)
-        stress_at_nodes = stress[:, None]  # [particle, 1, frame, 3]
-        xx, xy, yy = stress_at_nodes.unbind(dim=3)
-
-        pull_x = xx * slope_x + xy * slope_y
-        pull_y = xy * slope_x + yy * slope_y
-        force = -torch.stack([pull_x, pull_y], dim=3)  # [particle, 9, frame, 2]
-        contributions = force.flatten(2)
-        contributions = contributions.flatten(0, 1)  # [particle * 9, frame * 2]
-
-        node_count = mass.numel()
-        channels = contributions.shape[1]
-        sums = force.new_zeros(node_count, channels)
-        sums = sums.index_add(0, stencil.node, contributions)
-
-        node_mass = mass.flatten()
-        node_mass = node_mass.clamp(min=1e-9)
-        acceleration = sums / node_mass[:, None]
-        layers = len(mass)
-        by_node = acceleration.view(layers, columns, rows, -1)
-        return by_node.permute(0, 3, 1, 2)
-
     def offsets(self, stencil: Stencil, position: Tensor) -> Tensor:
         """Return the way from each particle to its nodes [length], [particle, 9, 2].
 
@@ -341,25 +287,6 @@ class ParticleGrid(nn.Module):
         by_wall = distance.movedim(-1, 0)
         return by_wall[self.walls].contiguous()
 
-    def share_inside(self) -> Tensor:
-        """Return the shares of the nodes' splines in the box [1], [x node, y node].
-
-        The box has two dimensions and walls.
-        """
-        low_x, low_y = self.low
-        high_x, high_y = self.high
-        axis_x, axis_y = self.axes
-        share_x = self._axis_share_inside(axis_x, low_x, high_x)
-        share_y = self._axis_share_inside(axis_y, low_y, high_y)
-        return share_x[:, None] * share_y
-
-    def _axis_share_inside(self, axis: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        to_high = (high - axis) / self.spacing
-        to_low = (low - axis) / self.spacing
-        share_below_high = _integrate_spline(to_high)
-        share_below_low = _integrate_spline(to_low)
-        return share_below_high - share_below_low
-
     def beside_walls(self) -> Tensor:
         """Return 1 at the two rows of nodes beside each wall, else 0.
 
@@ -369,14 +296,3 @@ class ParticleGrid(nn.Module):
         # a wall on nodes has its neighbours at 1, up to rounding
         is_beside = distance.abs() < 0.999
         return is_beside.to(torch.float32)
-
-
-def _integrate_spline(s: Tensor) -> Tensor:
-    """Return the integral of the spline up to a distance s from its node [cell]."""
-    s = s.clamp(-1.5, 1.5)
-    distance = s.abs()
-    inner = 0.5 + s * (0.75 - s * s / 3.0)
-    tail = (1.5 - distance) ** 3 / 6.0
-    outer = torch.where(s < 0.0, tail, 1.0 - tail)
-    is_inner = distance < 0.5
-    return torch.where(is_inner, inner, outer)

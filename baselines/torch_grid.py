@@ -246,25 +246,6 @@ def spline_weights(s: Tensor) -> Tensor:
     return weight
 
 
-def spline_slopes(s: Tensor) -> Tensor:
-    """Return the slopes of the nine weights along x and y [1/cell].
-
-    The shape is [particle, 2, 3, 3]; ``s`` is that of :func:`spline_weights`.
-    """
-    values = spline_values(s)
-    first = s - 1.5
-    second = 2.0 - 2.0 * s
-    third = s - 0.5
-    slopes = torch.stack([first, second, third], dim=1)
-    value_x = values[:, :, None, 0]
-    value_y = values[:, None, :, 1]
-    slope_x = slopes[:, :, None, 0]
-    slope_y = slopes[:, None, :, 1]
-    along_x = slope_x * value_y
-    along_y = value_x * slope_y
-    return torch.stack([along_x, along_y], dim=1)
-
-
 def spline_values(s: Tensor) -> Tensor:
     """Return the spline at three nodes along each axis, shape [particle, 3, axis]."""
     first = 0.5 * (1.5 - s) ** 2

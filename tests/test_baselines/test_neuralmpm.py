@@ -32,10 +32,6 @@ SMALL: dict[str, object] = {
     "noise_std": 0.0,
     "materials": [0, 1, 2, 3],
 }
-PROJECTED: dict[str, object] = {
-    "shape": [4, 8],
-    "density": [8],
-}
 
 
 def surrogate(
@@ -101,11 +97,6 @@ def change_material(window: Batch, material: Tensor) -> Batch:
     return replace(window, material=material)
 
 
-def make_too_dense(model: Any) -> None:
-    """Set the density limit so low that the projection corrects everything."""
-    nn.init.constant_(model.projection.limit, -2.0)
-
-
 def test_untrained_models_keep_every_velocity() -> None:
     """Without smoothing particles move on straight."""
     window = random_motion(2e-3)
@@ -133,10 +124,9 @@ def test_smoothing_damps_what_the_grid_does_not_see() -> None:
     assert float(ratio.max()) < 0.85
 
 
-@pytest.mark.parametrize("conserve", [False, True])
-def test_particles_stay_inside_the_walls(conserve: bool) -> None:
+def test_particles_stay_inside_the_walls() -> None:
     """Velocities are the differences of the positions, also where a wall stops."""
-    model = surrogate(awake=30.0, conserve=conserve)
+    model = surrogate(awake=30.0)
     first_frames = swirl(0, 3)
     second_frames = swirl(1, 3)
     window = batch(first_frames, second_frames)
@@ -156,15 +146,9 @@ def test_particles_stay_inside_the_walls(conserve: bool) -> None:
     assert_close(displacement, second_velocity, rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize("conserve", [False, True])
-def test_windows_side_by_side_do_not_see_each_other(conserve: bool) -> None:
+def test_windows_side_by_side_do_not_see_each_other() -> None:
     """Two windows in one batch roll out as they do alone, with walls and context."""
-    model = surrogate(
-        awake=0.1,
-        context=3,
-        wall_velocity=True,
-        conserve=conserve,
-    )
+    model = surrogate(awake=0.1, context=3, wall_velocity=True)
     first = swirl(0, 3)
     second = swirl(1, 3)
 
@@ -239,73 +223,6 @@ def test_recovery_asks_for_the_way_back(speed: float) -> None:
     assert loss == pytest.approx(expected, rel=1e-2)
 
 
-@pytest.mark.parametrize(
-    "projected",
-    [
-        {},
-        PROJECTED,
-    ],
-)
-def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> None:
-    """Two materials push each other apart, and their mean goes on and falls."""
-    model = surrogate(
-        awake=0.3,
-        conserve=True,
-        smoothing=0.3,
-        strain=True,
-        **projected,
-    )
-    nn.init.constant_(model.fall, -0.05)
-    if model.projection is not None:
-        make_too_dense(model)
-    frames = drift((2e-3, -1e-3), 3)
-    window = batch(frames)
-    window.material[::2] = 3
-
-    velocity = roll_out_velocities(model, window, 4).double()
-    fall = -0.05 * 10.0 * model.acceleration_std
-    expected = np.array(
-        [
-            (2e-3, -1e-3 + fall * 2),
-            (2e-3, -1e-3 + fall * 3),
-            (2e-3, -1e-3 + fall * 4),
-        ]
-    )
-    mean = velocity.mean(dim=0).numpy()
-    assert_allclose(mean, expected, rtol=0, atol=2e-7)
-
-    even_mean = velocity[::2].mean(dim=0)
-    odd_mean = velocity[1::2].mean(dim=0)
-    assert greatest_difference(even_mean, odd_mean) > 1e-5
-
-
-@pytest.mark.parametrize(
-    ("low", "is_pushed"),
-    [
-        (0.05, True),
-        (0.4, False),
-    ],
-)
-def test_walls_push_only_beside_them(low: float, is_pushed: bool) -> None:
-    """Beside a wall momentum changes; the wall does not reach a body in the middle."""
-    model = surrogate(conserve=True, materials=[0])
-    wall_bias = model.network.end.bias[-4:]
-    nn.init.constant_(wall_bias, 1.0)
-    body = jittered(0, low=low, high=low + 0.2)
-    frames = np.repeat(body[None], 3, axis=0)
-    window = liquid(frames)
-    path = rolled(model, window, 2)
-    change = greatest_difference(path[:, -1], window.position[:, -1])
-    assert (change > 1e-5) is is_pushed
-
-
-SYMMETRY_CASES: list[dict[str, object]] = [
-    {},
-    {"conserve": True},
-    {"conserve": True} | PROJECTED,
-]
-
-
 def sheared_window() -> Batch:
     """Return a window with strain and moving walls."""
     window = batch(swirl(0, 3), walls=True)
@@ -316,7 +233,7 @@ def sheared_window() -> Batch:
 
 
 @functools.cache
-def rolled_as_given(case: int, average: bool) -> tuple[Any, Tensor]:
+def rolled_as_given(*, average: bool) -> tuple[Any, Tensor]:
     """Return a model and its rollout, which all mirror images are compared with."""
     options = {
         "strain": True,
@@ -324,18 +241,14 @@ def rolled_as_given(case: int, average: bool) -> tuple[Any, Tensor]:
         "context": 3,
         "symmetry": "square",
     }
-    options |= SYMMETRY_CASES[case]
     model = surrogate(**options, awake=0.1, average=average)
     context_weight = model.context.numbers[-1].weight
     nn.init.normal_(context_weight, std=3.0)
-    if model.projection is not None:
-        make_too_dense(model)
     return model, rolled(model, sheared_window(), 4)
 
 
-@pytest.mark.parametrize("case", range(len(SYMMETRY_CASES)))
 @pytest.mark.parametrize("number", range(8))
-def test_the_mirror_average_has_the_symmetry_of_the_box(number: int, case: int) -> None:
+def test_the_mirror_average_has_the_symmetry_of_the_box(number: int) -> None:
     """The rollout of a mirror image is the mirror image of the rollout.
 
     That includes strain, moving walls and context.
@@ -344,7 +257,7 @@ def test_the_mirror_average_has_the_symmetry_of_the_box(number: int, case: int) 
     image = mirror_batch(sheared_window(), matrix[None], info().bounds)
 
     def image_error(*, average: bool) -> float:
-        model, path = rolled_as_given(case, average)
+        model, path = rolled_as_given(average=average)
         image_path = rolled(model, image, 4)
         expected = (path - 0.5) @ matrix.T + 0.5
         return greatest_difference(image_path, expected)
@@ -401,56 +314,6 @@ def test_a_strained_first_frame_matters_to_solids(
     strained_path = rolled(model, strained, 2)
     is_same = torch.equal(path, strained_path)
     assert is_same is not is_solid
-
-
-def test_bodies_come_back_to_the_shape_of_the_first_frame() -> None:
-    """Shape matching draws jelly together again that later frames pulled apart."""
-    rng = np.random.default_rng(0)
-    body = jittered(0, low=0.4, high=0.6)
-    first = torch.from_numpy(body).float()
-    velocity = rng.normal(0, 1, (256, 2)) * 0.02
-    frames = move_straight(body, velocity)
-    window = batch(frames)
-    jelly = torch.ones(256).long()
-    later = window.frame + 7
-    window = replace(window, material=jelly, frame=later)
-
-    def shape_error(**options: object) -> float:
-        model = surrogate(smoothing=0.0, **options)
-        origin = None
-        if model.origin:
-            origin = first
-        seen = replace(window, origin=origin)
-        last = rolled(model, seen, 6)[:, -1]
-        difference = torch.pdist(last) - torch.pdist(first)
-        return float(difference.abs().mean())
-
-    matched_error = shape_error(shape=[4, 8])
-    assert matched_error < 0.1 * shape_error()
-
-
-def test_density_projection_keeps_clouds_that_meet_apart() -> None:
-    """Two clouds that fly into each other end less dense with the projection."""
-    is_left = np.arange(512) < 256
-    direction = np.where(is_left, 1.0, -1.0)
-    velocity = direction[:, None] * np.array([8e-3, 0.0])
-    left = jittered(0, low=0.25, high=0.45)
-    right = jittered(1, low=0.55, high=0.75)
-    clouds = np.concatenate([left, right])
-    height = np.where(is_left, 0.15, -0.15)
-    clouds[:, 1] += height
-    frames = move_straight(clouds, velocity)
-    window = batch(frames)
-
-    def count_close_pairs(**options: object) -> float:
-        model = surrogate(smoothing=0.0, **options)
-        path = rolled(model, window, 16)
-        position = path[:, -1]
-        is_close = torch.cdist(position, position) < 0.02
-        return float(is_close.sum())
-
-    projected_count = count_close_pairs(density=[8, 16])
-    assert projected_count < 0.75 * count_close_pairs()
 
 
 class Drag(nn.Module):

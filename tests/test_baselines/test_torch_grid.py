@@ -379,56 +379,6 @@ def test_gather_is_the_adjoint_of_spread() -> None:
     assert_close(spread[:1], alone)
 
 
-def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
-    """The forces are those by torch's own gradients of the weights.
-
-    Their sum and their moment vanish.
-    """
-    grid = ParticleGrid(BOX, 9, multiple=4)
-    place = draw_cloud(200)
-    layer = torch.arange(200) % 2
-    generator = torch.Generator().manual_seed(0)
-    stress = torch.randn(200, 3, 3, generator=generator)
-    stencil = grid.stencil(place, layer)
-    mass = grid.spread(stencil, torch.ones(200, 1), 2)
-    acceleration = grid.accelerate(stencil, place, stress, mass)
-    force_field = (acceleration * mass).permute(0, 2, 3, 1)
-    force = force_field.reshape(-1, 3, 2)
-
-    # The slope of each of the nine weights at each particle, shape [200, 9, 2].
-    variable = place.clone().requires_grad_()
-    weight = grid.stencil(variable, layer).weight
-    slopes = []
-    for node in range(9):
-        (slope,) = torch.autograd.grad(
-            weight[:, node].sum(),
-            variable,
-            retain_graph=True,
-        )
-        slopes.append(slope)
-
-    components = stress[..., [0, 1, 1, 2]]
-    matrix = components.unflatten(2, (2, 2))
-    slope_of_node = torch.stack(slopes, dim=1)
-    pull = torch.einsum("pfcd,pnd->pnfc", matrix, slope_of_node)
-    pull = -grid.spacing * pull
-    columns, rows = grid.shape
-    node_count = 2 * columns * rows
-    expected = torch.zeros(node_count, 3, 2)
-    expected.index_add_(0, stencil.node, pull.flatten(0, 1))
-    assert_close(force, expected, rtol=0, atol=2e-5)
-
-    nodes = torch.cartesian_prod(grid.axis_x, grid.axis_y)
-    x, y = nodes.repeat(2, 1).T[..., None]
-    force_x, force_y = force.unbind(2)
-    moment = (x * force_y - y * force_x).sum(0)
-    total = force.sum(dim=0)
-    no_force = torch.zeros(3, 2)
-    no_moment = torch.zeros(3)
-    assert_close(total, no_force, rtol=0, atol=1e-4)
-    assert_close(moment, no_moment, rtol=0, atol=1e-4)
-
-
 def test_walls_lie_between_two_rows_of_nodes() -> None:
     """The nodes beside a wall are half a cell from it, on both sides."""
     grid = ParticleGrid(BOX, 7)
