@@ -37,7 +37,7 @@ LAYERS = (
     ("submission",),
     ("make",),
     ("references",),
-    ("exchange", "scoring"),
+    ("exchange", "scoring", "design"),
     ("figures.report", "baselines", "models"),
     ("board",),
     ("cli", "__main__"),

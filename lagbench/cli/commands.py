@@ -19,6 +19,12 @@ class Command(NamedTuple):
     example: str
 
 
+# first word, heading of the help, summary
+COMMAND_GROUPS = (
+    ("leaderboard", "Leaderboard", "Draw, check and show the leaderboard."),
+    ("design", "Design", "Search for parameters, judged by the simulator."),
+)
+
 COMMANDS = (
     Command(
         "Begin",
@@ -215,5 +221,26 @@ COMMANDS = (
         "leaderboard:show_command",
         "Print the tables of the leaderboard.",
         "leaderboard show cavity --size mini",
+    ),
+    Command(
+        "Design",
+        "design list",
+        "design:list_command",
+        "List all design tasks.",
+        "design list",
+    ),
+    Command(
+        "Design",
+        "design info",
+        "design:info_command",
+        "Show the goal of a task, and its parameters with their bounds.",
+        "design info pour-03",
+    ),
+    Command(
+        "Design",
+        "design judge",
+        "design:judge_command",
+        "Simulate the parameters of an entry and measure what they reach.",
+        "design judge entry.json --workers 2",
     ),
 )

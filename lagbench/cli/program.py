@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError, Group, Parameter, UnknownCommandError
 
 from lagbench.errors import LagbenchError, explain_system_error, suggest_name
 
-from .commands import COMMANDS
+from .commands import COMMAND_GROUPS, COMMANDS
 from .stderr import print_on_stderr
 
 USAGE = 2
@@ -40,16 +40,13 @@ def build_program() -> App:
     )
     headings = list(dict.fromkeys(command.group for command in COMMANDS))
     groups = {name: Group(name, sort_key=headings.index(name)) for name in headings}
-    leaderboard = App(
-        name="leaderboard",
-        help="Draw, check and show the leaderboard.",
-        group=groups["Leaderboard"],
-    )
-    program.command(leaderboard)
+    parents = {"": program}
+    for name, heading, summary in COMMAND_GROUPS:
+        parents[name] = App(name=name, help=summary, group=groups[heading])
+        program.command(parents[name])
     for command in COMMANDS:
         first_word, _, name = command.name.rpartition(" ")
-        parent = leaderboard if first_word else program
-        parent.command(
+        parents[first_word].command(
             f"lagbench.cli.{command.target}",
             name=name,
             help=command.summary,
