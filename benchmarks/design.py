@@ -116,7 +116,9 @@ class Recorder:
         return value
 
 
-def search_all(method: str, *, seed: int, names: Sequence[str], budget: int) -> None:
+def search_all(
+    method: str, *, seed: int, names: Sequence[str], budget: int, rows: Path
+) -> None:
     """Search every task; the entries of all budgets grow task by task."""
     entries = {}
     for each in BUDGETS:
