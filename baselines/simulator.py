@@ -384,15 +384,7 @@ class GraphNetwork(Baseline):
             force_unit=self.acceleration_std,
             reach=wall_reach,
         )
-        self.network = EncodeProcessDecode(
-            self.operator,
-            node_features=self.features.count + self.forcing.count,
-            edge_features=info.box.dimension + 1,
-            outputs=info.box.dimension,
-            latent=options.latent,
-            layers=options.layers,
-            sum_messages=options.sum_messages,
-        )
+        self.network = self._make_network()
         self.free_flight: FreeFlight | None = None
         if options.free_flight is not None:
             self.free_flight = FreeFlight(
@@ -408,9 +400,22 @@ class GraphNetwork(Baseline):
                 iterations=options.relaxation,
                 densest=options.densest,
             )
-        last_layer = self.network.decoder[-1]
+
+    def _make_network(self) -> nn.Module:
+        """Return the network with new weights; untrained it returns zeros."""
+        network = EncodeProcessDecode(
+            self.operator,
+            node_features=self.features.count + self.forcing.count,
+            edge_features=self.info.box.dimension + 1,
+            outputs=self.info.box.dimension,
+            latent=self.options.latent,
+            layers=self.options.layers,
+            sum_messages=self.options.sum_messages,
+        )
+        last_layer = network.decoder[-1]
         for parameter in last_layer.parameters():
             nn.init.zeros_(parameter)
+        return network
 
     def _check_options(self) -> None:
         """Refuse options that contradict each other, the data or the operator.
@@ -787,20 +792,33 @@ class GraphNetwork(Baseline):
 
         The losses are those of the operator.
         """
+        node = self._node_features(state)
+        edge = edge_features(state.position, edge_index, self.radius, self.box)
+        output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
+        return output
+
+    def _node_features(self, state: ParticleState) -> Tensor:
+        """Return the features of each particle [1], shape [particle, feature]."""
         walls = None
         if state.wall_velocity is not None:
             next_frame = state.wall_velocity[:, 0]
             walls = next_frame[state.sample]
-        node = self.features(state.position, state.velocity, state.material, walls)
-        if self.forcing.count:
-            force = None
-            if state.body_force is not None:
-                force = state.body_force[:, 0]
-            forcing = self.forcing(state.position, state.sample, force, state.obstacle)
-            node = torch.cat([node, forcing], dim=1)
-        edge = edge_features(state.position, edge_index, self.radius, self.box)
-        output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
-        return output
+        node: Tensor = self.features(
+            state.position, state.velocity, state.material, walls
+        )
+        if not self.forcing.count:
+            return node
+        return torch.cat([node, self._forcing_features(state)], dim=1)
+
+    def _forcing_features(self, state: ParticleState) -> Tensor:
+        """Return the features of force and obstacle [1], shape [particle, feature]."""
+        force = None
+        if state.body_force is not None:
+            force = state.body_force[:, 0]
+        features: Tensor = self.forcing(
+            state.position, state.sample, force, state.obstacle
+        )
+        return features
 
     def _keep_inside(self, position: Tensor) -> Tensor:
         """Return positions in the box, with the gradient of those given.

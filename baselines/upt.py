@@ -1,0 +1,154 @@
+"""UPT: a transformer over supernodes of the whole box."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from .baseline import DatasetInfo
+from .corgi import GridOptions, mean_at_nodes
+from .network import mlp
+from .operators.gns import GNS
+from .operators.operator import Losses
+from .particle_grid import ParticleGrid
+from .simulator import GraphNetwork, ParticleState
+
+WAVES = 4  # of the code of a position, along each axis
+
+
+class UPTOptions(GridOptions):
+    """Options of a universal physics transformer."""
+
+    of_weights = GridOptions.of_weights | {"heads"}
+
+    cells: int = Field(default=8, ge=4)  # cells of supernodes across the box
+    heads: int = Field(default=4, ge=1)  # of attention; they divide model.latent
+
+
+class Latents(nn.Module):
+    r"""Encoder, approximator and decoder of a universal physics transformer.
+
+    .. math::
+
+        z_n &= \textstyle\sum_i b_{ni} \phi(h_i, p(x_i)) / \sum_i b_{ni} + W p(x_n) \\
+        z &\leftarrow \mathrm{Transformer}(z) \\
+        y_i &= \psi(q_i + \mathrm{Attention}(q_i, z)), \quad q_i = \phi(h_i, p(x_i))
+
+    p are sines and cosines of the position in the box.
+    """
+
+    def __init__(
+        self,
+        *,
+        features: int,
+        codes: int,
+        latent: int,
+        layers: int,
+        heads: int,
+        outputs: int,
+    ) -> None:
+        super().__init__()
+        self.encoder = mlp([features + codes, latent, latent])
+        self.supernode = nn.Linear(latent + 1 + codes, latent)
+        self.layers = nn.ModuleList()
+        for _ in range(layers):
+            layer = nn.TransformerEncoderLayer(
+                latent,
+                heads,
+                2 * latent,
+                dropout=0.0,
+                activation="gelu",
+                batch_first=True,
+                norm_first=True,
+            )
+            self.layers.append(layer)
+        self.norm = nn.LayerNorm(latent)
+        self.attention = nn.MultiheadAttention(latent, heads, batch_first=True)
+        self.decoder = mlp([latent, latent, latent, outputs], norm=False)
+        nn.init.zeros_(self.decoder[-1].weight)
+        nn.init.zeros_(self.decoder[-1].bias)
+
+
+class UPT(GraphNetwork):
+    """A universal physics transformer (Alkin et al. 2024) without a latent rollout.
+
+    The supernodes are the nodes of a coarse grid, which take the mean of the particles
+    around them, instead of particles that are drawn: so the order of particles has no
+    effect. There is no graph and no pooling of supernodes, and every frame is encoded
+    anew. Positions are those in the box: the prediction moves with particles and box
+    together, and turns with nothing.
+    """
+
+    method = "UPT"
+    operator = GNS
+    recipes = "recipes/particle-networks.yaml"
+    Options = UPTOptions
+    options: UPTOptions
+
+    def __init__(self, options: UPTOptions, info: DatasetInfo) -> None:
+        super().__init__(options, info)
+        self.nodes = ParticleGrid(
+            info.bounds, options.cells, periodic=info.box.periodic
+        )
+
+    def _make_network(self) -> nn.Module:
+        """Return the network; untrained, it returns zeros."""
+        axes = self.info.box.dimension
+        return Latents(
+            features=self.features.count + self.forcing.count,
+            codes=2 * WAVES * axes,
+            latent=self.options.latent,
+            layers=self.options.layers,
+            heads=self.options.heads,
+            outputs=axes,
+        )
+
+    def find_edges(self, state: ParticleState) -> Tensor:
+        """Return no edges: the network has no graph."""
+        return torch.empty(2, 0, dtype=torch.int64, device=state.position.device)
+
+    def predict(
+        self,
+        state: ParticleState,
+        edge_index: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, Losses]:
+        """Return the standardised target [1], shape [particle, axis], and no losses."""
+        network = self.network
+        code = self._encode(state.position)
+        query = network.encoder(torch.cat([self._node_features(state), code], dim=1))
+
+        windows = int(state.sample[-1]) + 1
+        stencil = self.nodes.stencil(state.position, state.sample)
+        field = mean_at_nodes(self.nodes, stencil, query, windows)
+        places = torch.cartesian_prod(*self.nodes.axes)
+        node_code = self._encode(places).expand(windows, -1, -1)
+        by_node = field.flatten(2).transpose(1, 2)
+        latents = network.supernode(torch.cat([by_node, node_code], dim=2))
+        for layer in network.layers:
+            latents = layer(latents)
+        latents = network.norm(latents)
+
+        counts = torch.bincount(state.sample).tolist()
+        felt = []
+        for own, latent in zip(query.split(counts), latents, strict=True):
+            answer, _ = network.attention(own, latent, latent, need_weights=False)
+            felt.append(answer)
+        return network.decoder(query + torch.cat(felt)), {}
+
+    def _encode(self, position: Tensor) -> Tensor:
+        """Return sines and cosines of positions in the box, shape [place, code].
+
+        The longest wave is twice the side of the box, or the period.
+        """
+        waves = []
+        for axis, (low, high) in enumerate(self.info.bounds):
+            longest = (2 - self.info.box.periodic[axis]) * (high - low)
+            numbers = 2.0 ** torch.arange(WAVES, device=position.device)
+            place = (position[:, axis, None] - low) / longest
+            phase = 2.0 * math.pi * numbers * place
+            waves += [phase.sin(), phase.cos()]
+        return torch.cat(waves, dim=1).to(position.dtype)
