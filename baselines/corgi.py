@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from .baseline import DatasetInfo
 from .graph import edge_features
+from .network import EncodeProcessDecode
 from .operators.gns import GNS
-from .operators.operator import Losses
+from .operators.operator import Losses, Operator
 from .particle_grid import ParticleGrid, Stencil
 from .simulator import GraphNetwork, GraphNetworkOptions, ParticleState
 from .unet import NODES_PER_COARSE_NODE, UNet
@@ -38,10 +41,11 @@ class CoRGI(GraphNetwork):
     """
 
     method = "CoRGI"
-    operator = GNS
+    operator: ClassVar[type[Operator]] = GNS
     recipes = "recipes/particle-networks.yaml"
     Options = GridOptions
     options: GridOptions
+    network: EncodeProcessDecode
 
     def __init__(self, options: GridOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)

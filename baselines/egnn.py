@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from .equivariant import EquivariantNetwork, Particles, count_neighbours
 from .graph import safe_length
-from .network import EdgeMLP, mlp
+from .network import EdgeMLP, LayeredNetwork, mlp
 from .operators.operator import sum_edges
 
 
@@ -29,9 +29,9 @@ class EGNNLayer(nn.Module):
         self.force = mlp([latent, latent, 1], norm=False)
         self.share = mlp([latent, latent, vectors], norm=False)
         self.update = mlp([2 * latent, latent, latent])
-        for part in (self.force, self.share):
-            nn.init.zeros_(part[-1].weight)
-            nn.init.zeros_(part[-1].bias)
+        for last_layer in (self.force[-1], self.share[-1]):
+            for parameter in last_layer.parameters():
+                nn.init.zeros_(parameter)
 
     def forward(
         self,
@@ -54,7 +54,7 @@ class EGNNLayer(nn.Module):
         return node, own.sum(dim=1) + force
 
 
-class EGNNLayers(nn.Module):
+class EGNNLayers(LayeredNetwork):
     r"""Layers that also move the particles, by the velocity that they predict.
 
     .. math:: x_i \leftarrow x_i + (v_i + a_i) / L
@@ -106,7 +106,7 @@ class EGNN(EquivariantNetwork):
 
     method = "EGNN"
 
-    def _make_network(self) -> nn.Module:
+    def _make_network(self) -> LayeredNetwork:
         """Return the network; untrained, it returns zeros."""
         return EGNNLayers(
             scalars=self.scalars,

@@ -9,7 +9,7 @@ prediction turns with the particles alone.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +19,7 @@ from .deviations import root_mean_square
 from .graph import EMBEDDING, Standardisation, edge_features, wall_distance
 from .network import LayerNorm
 from .operators.gns import GNS
-from .operators.operator import Losses, sum_edges
+from .operators.operator import Losses, Operator, sum_edges
 from .simulator import GraphNetwork, GraphNetworkOptions, ParticleState
 
 
@@ -45,7 +45,7 @@ class EquivariantNetwork(GraphNetwork):
     All axes have the same scale, and no mean is taken off.
     """
 
-    operator = GNS
+    operator: ClassVar[type[Operator]] = GNS
     recipes = "recipes/particle-networks.yaml"
 
     def __init__(self, options: GraphNetworkOptions, info: DatasetInfo) -> None:
@@ -98,7 +98,7 @@ class EquivariantNetwork(GraphNetwork):
         distance = wall_distance(
             state.position, features.bounds, features.reach, features.periodic
         )
-        low, high = distance.unflatten(1, (axes, 2)).unbind(dim=2)
+        low, high = distance.view(-1, axes, 2).unbind(dim=2)
         gravity = self.gravity.expand_as(low)
         vectors = [last_velocity, changes, (high - low)[:, None], gravity[:, None]]
         if self.options.wall_velocity:

@@ -65,7 +65,18 @@ class ProcessorLayer(nn.Module):
         return next_node, next_edge, losses
 
 
-class EncodeProcessDecode(nn.Module):
+class LayeredNetwork(nn.Module):
+    """A network of layers that a training may compile."""
+
+    layers: nn.ModuleList
+
+    def compile_layers(self) -> None:
+        """Compile the layers, for any number of edges."""
+        for layer in self.layers:
+            layer.compile(dynamic=True)
+
+
+class EncodeProcessDecode(LayeredNetwork):
     """A graph network after Sanchez-Gonzalez et al. (2020), section 3.
 
     Two MLPs encode nodes and edges, processor layers with weights of their own update

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from .equivariant import EquivariantNetwork, Norm, Particles, sum_vectors
 from .graph import safe_length
+from .network import LayeredNetwork
 from .operators.operator import sum_edges
 
 BASIS = 20  # radial functions
@@ -90,7 +91,7 @@ def two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     )
 
 
-class PaiNNLayers(nn.Module):
+class PaiNNLayers(LayeredNetwork):
     """Scalars and vectors of the input, layers, and one vector of each particle."""
 
     def __init__(self, *, scalars: int, vectors: int, latent: int, layers: int) -> None:
@@ -124,7 +125,7 @@ class PaiNN(EquivariantNetwork):
 
     method = "PaiNN"
 
-    def _make_network(self) -> nn.Module:
+    def _make_network(self) -> LayeredNetwork:
         """Return the network; untrained, it returns zeros."""
         return PaiNNLayers(
             scalars=self.scalars,

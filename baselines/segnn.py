@@ -14,6 +14,7 @@ from .equivariant import (
     sum_vectors,
 )
 from .graph import safe_length
+from .network import LayeredNetwork
 from .operators.operator import sum_edges
 
 
@@ -112,7 +113,7 @@ class SEGNNLayer(nn.Module):
         return scalar + change, vector + vector_change
 
 
-class SEGNNLayers(nn.Module):
+class SEGNNLayers(LayeredNetwork):
     """A steerable encoder, layers, and one vector of each particle."""
 
     def __init__(self, *, scalars: int, vectors: int, latent: int, layers: int) -> None:
@@ -161,7 +162,7 @@ class SEGNN(EquivariantNetwork):
 
     method = "SEGNN"
 
-    def _make_network(self) -> nn.Module:
+    def _make_network(self) -> LayeredNetwork:
         """Return the network; untrained, it returns zeros."""
         return SEGNNLayers(
             scalars=self.scalars,

@@ -50,7 +50,7 @@ from .graph import (
     edge_features,
     radius_graph,
 )
-from .network import EncodeProcessDecode
+from .network import EncodeProcessDecode, LayeredNetwork
 from .relaxation import Relaxation
 from .torch_grid import TensorFields, tensor_fields, transfer
 
@@ -401,7 +401,7 @@ class GraphNetwork(Baseline):
                 densest=options.densest,
             )
 
-    def _make_network(self) -> nn.Module:
+    def _make_network(self) -> LayeredNetwork:
         """Return the network with new weights; untrained it returns zeros."""
         network = EncodeProcessDecode(
             self.operator,

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from .baseline import DatasetInfo
 from .corgi import GridOptions, mean_at_nodes
-from .network import mlp
+from .network import LayeredNetwork, mlp
 from .operators.gns import GNS
-from .operators.operator import Losses
+from .operators.operator import Losses, Operator
 from .particle_grid import ParticleGrid
 from .simulator import GraphNetwork, ParticleState
 
@@ -28,29 +28,32 @@ class UPTOptions(GridOptions):
     heads: int = Field(default=4, ge=1)  # of attention; they divide model.latent
 
 
-class Latents(nn.Module):
-    r"""Encoder, approximator and decoder of a universal physics transformer.
+class UPTLayers(LayeredNetwork):
+    r"""Encoder, approximator and decoder.
 
     .. math::
 
-        z_n &= \textstyle\sum_i b_{ni} \phi(h_i, p(x_i)) / \sum_i b_{ni} + W p(x_n) \\
+        q_i &= \phi(h_i, p(x_i)), \quad
+            z_n = W [\textstyle\sum_i b_{ni} q_i / \sum_i b_{ni}, p(x_n)] \\
         z &\leftarrow \mathrm{Transformer}(z) \\
-        y_i &= \psi(q_i + \mathrm{Attention}(q_i, z)), \quad q_i = \phi(h_i, p(x_i))
+        y_i &= \psi(q_i + \mathrm{Attention}(q_i, z))
 
-    p are sines and cosines of the position in the box.
+    h are the features of particles, b the splines of the supernodes n, p sines and
+    cosines of a position.
     """
 
     def __init__(
         self,
+        grid: ParticleGrid,
         *,
         features: int,
-        codes: int,
         latent: int,
         layers: int,
         heads: int,
-        outputs: int,
     ) -> None:
         super().__init__()
+        self.grid = grid
+        codes = 2 * WAVES * grid.dimension
         self.encoder = mlp([features + codes, latent, latent])
         self.supernode = nn.Linear(latent + 1 + codes, latent)
         self.layers = nn.ModuleList()
@@ -67,9 +70,47 @@ class Latents(nn.Module):
             self.layers.append(layer)
         self.norm = nn.LayerNorm(latent)
         self.attention = nn.MultiheadAttention(latent, heads, batch_first=True)
-        self.decoder = mlp([latent, latent, latent, outputs], norm=False)
-        nn.init.zeros_(self.decoder[-1].weight)
-        nn.init.zeros_(self.decoder[-1].bias)
+        self.decoder = mlp([latent, latent, latent, grid.dimension], norm=False)
+        for parameter in self.decoder[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, feature: Tensor, position: Tensor, sample: Tensor) -> Tensor:
+        """Return the output of each particle, shape [particle, axis]."""
+        code = self._encode(position)
+        query = self.encoder(torch.cat([feature, code], dim=1))
+
+        windows = int(sample[-1]) + 1
+        stencil = self.grid.stencil(position, sample)
+        field = mean_at_nodes(self.grid, stencil, query, windows)
+        places = torch.cartesian_prod(*self.grid.axes)
+        node_code = self._encode(places).expand(windows, -1, -1)
+        by_node = field.flatten(2).transpose(1, 2)
+        latents = self.supernode(torch.cat([by_node, node_code], dim=2))
+        for layer in self.layers:
+            latents = layer(latents)
+        latents = self.norm(latents)
+
+        counts = torch.bincount(sample).tolist()
+        felt = []
+        for own, latent in zip(query.split(counts), latents, strict=True):
+            answer, _ = self.attention(own, latent, latent, need_weights=False)
+            felt.append(answer)
+        output: Tensor = self.decoder(query + torch.cat(felt))
+        return output
+
+    def _encode(self, position: Tensor) -> Tensor:
+        """Return sines and cosines of positions in the box, shape [place, code].
+
+        The longest wave is twice the side of the box, or the period.
+        """
+        waves = []
+        for axis, (low, high) in enumerate(self.grid.bounds):
+            longest = (2 - self.grid.periodic[axis]) * (high - low)
+            numbers = 2.0 ** torch.arange(WAVES, device=position.device)
+            place = (position[:, axis, None] - low) / longest
+            phase = 2.0 * math.pi * numbers * place
+            waves += [phase.sin(), phase.cos()]
+        return torch.cat(waves, dim=1).to(position.dtype)
 
 
 class UPT(GraphNetwork):
@@ -83,27 +124,22 @@ class UPT(GraphNetwork):
     """
 
     method = "UPT"
-    operator = GNS
+    operator: ClassVar[type[Operator]] = GNS
     recipes = "recipes/particle-networks.yaml"
     Options = UPTOptions
     options: UPTOptions
 
-    def __init__(self, options: UPTOptions, info: DatasetInfo) -> None:
-        super().__init__(options, info)
-        self.nodes = ParticleGrid(
-            info.bounds, options.cells, periodic=info.box.periodic
-        )
-
-    def _make_network(self) -> nn.Module:
+    def _make_network(self) -> LayeredNetwork:
         """Return the network; untrained, it returns zeros."""
-        axes = self.info.box.dimension
-        return Latents(
+        grid = ParticleGrid(
+            self.info.bounds, self.options.cells, periodic=self.info.box.periodic
+        )
+        return UPTLayers(
+            grid,
             features=self.features.count + self.forcing.count,
-            codes=2 * WAVES * axes,
             latent=self.options.latent,
             layers=self.options.layers,
             heads=self.options.heads,
-            outputs=axes,
         )
 
     def find_edges(self, state: ParticleState) -> Tensor:
@@ -117,38 +153,5 @@ class UPT(GraphNetwork):
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
         """Return the standardised target [1], shape [particle, axis], and no losses."""
-        network = self.network
-        code = self._encode(state.position)
-        query = network.encoder(torch.cat([self._node_features(state), code], dim=1))
-
-        windows = int(state.sample[-1]) + 1
-        stencil = self.nodes.stencil(state.position, state.sample)
-        field = mean_at_nodes(self.nodes, stencil, query, windows)
-        places = torch.cartesian_prod(*self.nodes.axes)
-        node_code = self._encode(places).expand(windows, -1, -1)
-        by_node = field.flatten(2).transpose(1, 2)
-        latents = network.supernode(torch.cat([by_node, node_code], dim=2))
-        for layer in network.layers:
-            latents = layer(latents)
-        latents = network.norm(latents)
-
-        counts = torch.bincount(state.sample).tolist()
-        felt = []
-        for own, latent in zip(query.split(counts), latents, strict=True):
-            answer, _ = network.attention(own, latent, latent, need_weights=False)
-            felt.append(answer)
-        return network.decoder(query + torch.cat(felt)), {}
-
-    def _encode(self, position: Tensor) -> Tensor:
-        """Return sines and cosines of positions in the box, shape [place, code].
-
-        The longest wave is twice the side of the box, or the period.
-        """
-        waves = []
-        for axis, (low, high) in enumerate(self.info.bounds):
-            longest = (2 - self.info.box.periodic[axis]) * (high - low)
-            numbers = 2.0 ** torch.arange(WAVES, device=position.device)
-            place = (position[:, axis, None] - low) / longest
-            phase = 2.0 * math.pi * numbers * place
-            waves += [phase.sin(), phase.cos()]
-        return torch.cat(waves, dim=1).to(position.dtype)
+        features = self._node_features(state)
+        return self.network(features, state.position, state.sample), {}
