@@ -56,8 +56,14 @@ USELESS = 2.0
 is accepted.
 """
 
-SAME = 1e-5
-"""Difference of the moments of two frames that hold the same particles [extent]."""
+SAME = 1e-7
+ALIKE = 1e-5
+"""Difference of the moments of two frames that hold the same particles, and of two that
+may, in other digits [extent].
+"""
+
+STEADY = 0.1
+"""Difference of two steps, over their size, in steady motion."""
 
 MOST_COPIES = 8
 """Frames of other trajectories that are compared with one."""
@@ -77,6 +83,8 @@ class Judgement:
     low: Floats  # lowest position [length], [axis]
     high: Floats  # highest position [length], [axis]
     moments: Floats  # mean, covariance and skewness of the positions, [frame, moment]
+    # what no shift, turn, mirror or scale changes, of positions and steps, [frame, one]
+    shapes: Floats
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -107,7 +115,9 @@ def judge_trajectory(
     """
     motion = _Motion(name)
     moments = []
+    shapes = []
     sides = []
+    before = None
     for number, (raw_position, velocity) in enumerate(frames):
         position = raw_position.astype(np.float64)
         where = f"{name}, frame {number}"
@@ -119,6 +129,9 @@ def judge_trajectory(
             _refuse_lone_particle(position, where)
         sides.append((position.min(axis=0), position.max(axis=0)))
         moments.append(_moments(position))
+        step = 0.0 * position if before is None else box.displacement(before, position)
+        shapes.append(_shape(position, step))
+        before = position
         motion.add(position, velocity, box)
     low, high = np.array(sides).transpose(1, 0, 2)
     _refuse_blow_up(name, (high - low).max(axis=1))
@@ -126,12 +139,17 @@ def judge_trajectory(
     motion.refuse_uneven_frames()
     motion.refuse_jumps(box or unit_box(2))
     motion.refuse_velocities(frame_interval)
-    notes = [*motion.describe_resolution(raw_position), *motion.describe_rest()]
+    notes = [
+        *motion.describe_resolution(raw_position),
+        *motion.describe_rest(),
+        *motion.describe_unmoved(position),
+    ]
     return Judgement(
         name=name,
         low=low.min(axis=0),
         high=high.max(axis=0),
         moments=np.array(moments),
+        shapes=np.array(shapes),
         notes=notes,
     )
 
@@ -208,6 +226,17 @@ def _moments(position: Floats) -> Floats:
     return np.concatenate([mean, covariance[upper], (offset**3).mean(axis=0)])
 
 
+def _shape(position: Floats, step: Floats) -> Floats:
+    """Return what stays as it is when all is moved, turned, mirrored or scaled."""
+    offset = position - position.mean(axis=0)
+    distance = np.linalg.norm(offset, axis=1)
+    size = math.sqrt(float(np.mean(distance**2))) or 1.0
+    powers = [float(np.mean((distance / size) ** power)) for power in (1, 3, 4)]
+    length = np.linalg.norm(step, axis=1) / size
+    turn = float(np.mean(np.sum(offset * step, axis=1))) / size**2
+    return np.array([*powers, length.mean(), np.sqrt(np.mean(length**2)), turn])
+
+
 class _Motion:
     """The steps of some particles of a trajectory, and the jumps of all."""
 
@@ -215,11 +244,13 @@ class _Motion:
         self.name = name
         self.samples = np.zeros(0, int)  # numbers of the particles
         self.before: Floats = np.zeros(0)  # positions in the frame before
+        self.is_unmoved: NDArray[np.bool_] = np.zeros(0, bool)
         self.step_before: Floats | None = None
         self.steps: list[Floats] = []  # [frame] of [sample, axis]
         self.gaps: list[Floats] = []  # ways to the nearest neighbour, of [sample]
         self.others: list[Floats] = []  # ways to the nearest old place, of [sample]
         self.strayed: list[Floats] = []  # steps beside those of neighbours, of [sample]
+        self.row_bends: list[float] = []  # median change of the way from row to row
         self.adjacent: list[float] = []  # share whose nearest neighbour is the next row
         self.velocities: list[Floats] = []
         # by axis: frame and signed step of particles that cross half the extent
@@ -243,11 +274,17 @@ class _Motion:
             self.low = position.min(axis=0)
             self.high = position.max(axis=0)
             self.before = position
+            self.is_unmoved = np.ones(count, bool)
+            if velocity is not None:
+                self.velocities.append(velocity[self.samples].astype(np.float64))
             return
         step = box.displacement(self.before, position)
         if count > 1:
             self._compare_with_neighbours(position, step, box)
         self.steps.append(step[self.samples])
+        self.is_unmoved &= (position == self.before).all(axis=1)
+        bend = np.diff(position, n=2, axis=0)
+        self.row_bends.append(float(np.median(np.linalg.norm(bend, axis=1))))
         if velocity is not None:
             self.velocities.append(velocity[self.samples].astype(np.float64))
         self.low = np.minimum(self.low, position.min(axis=0))
@@ -325,7 +362,11 @@ class _Motion:
                 "(an array id does it), or state --axes"
             )
         ratio = np.median(lengths / np.maximum(gaps, 1e-300), axis=1)
-        if np.median(ratio) > 2.0 and np.median(self.adjacent) > 0.8:
+        # a motion is smoother from frame to frame than from particle to particle
+        is_rough = (
+            np.median(change) > np.median(self.row_bends) if len(change) else True
+        )
+        if np.median(ratio) > 2.0 and np.median(self.adjacent) > 0.8 and is_rough:
             raise DataError(
                 f"{self.name}: particles move {np.median(ratio):.3g} times as far in a "
                 "frame as to their nearest neighbour, which is the next row: frames "
@@ -335,30 +376,62 @@ class _Motion:
 
     def refuse_uneven_frames(self) -> None:
         """Refuse frames that are missing, there twice, or out of order."""
-        for number in range(1, len(self.steps) - 1):
-            before, step, after = self.steps[number - 1 : number + 2]
-            mean = 0.5 * (before + after)
-            size = _rms(step)
-            usual = max(_rms(before), _rms(after))
-            is_steady = _rms(after - before) < 0.5 * _rms(mean)
-            fault = None
-            if size > SPIKE * usual > 0.0:
-                fault = "frames are missing or out of order, or rows change their order"
-            elif usual > 0.0 and is_steady:
-                ratio = float(np.sum(step * mean) / np.sum(mean * mean))
-                if ratio > GAP:
-                    fault = "frames are missing before it"
-                elif size == 0.0:
-                    fault = "the frame is there twice"
-                elif ratio < 0.0:
-                    fault = "frames are out of order"
+        last = len(self.steps) - 1
+        for number in range(last + 1):
+            fault = self._find_change_of_pace(number)
+            if 0 < number < last:
+                fault = self._find_fault_between(number) or fault
             if fault is not None:
+                sizes = [f"{_rms(step):.3g}" for step in self.steps]
                 raise DataError(
-                    f"{self.name}, frame {number + 1}: particles move {size:.3g}, and "
-                    f"{_rms(before):.3g} and {_rms(after):.3g} in the frames before "
-                    f"and after: {fault}; give all frames once, at even times, or end "
-                    "the trajectory before this frame"
+                    f"{self.name}, frame {number + 1}: particles move {sizes[number]}, "
+                    f"and {', '.join(sizes[max(0, number - 2) : number]) or 'nothing'} "
+                    "in frames before and "
+                    f"{', '.join(sizes[number + 1 : number + 3]) or 'nothing'} after: "
+                    f"{fault}; give all frames once, at even times, or end the "
+                    "trajectory before this frame"
                 )
+
+    def _find_fault_between(self, number: int) -> str | None:
+        """Return what is wrong with a step beside those before and after."""
+        before, step, after = self.steps[number - 1 : number + 2]
+        mean = 0.5 * (before + after)
+        size = _rms(step)
+        usual = max(_rms(before), _rms(after))
+        if size > SPIKE * usual > 0.0:
+            return "frames are missing or out of order, or rows change their order"
+        if usual == 0.0 or _rms(after - before) >= 0.5 * _rms(mean):
+            return None
+        ratio = float(np.sum(step * mean) / np.sum(mean * mean))
+        if ratio > GAP:
+            return "frames are missing before it"
+        if size == 0.0:
+            return "the frame is there twice"
+        return "frames are out of order" if ratio < 0.0 else None
+
+    def _find_change_of_pace(self, number: int) -> str | None:
+        """Return what is wrong where a steady motion has another pace from here on.
+
+        The same is said of the first step, beside the two after it.
+        """
+        steady = self.steps[1:3] if number == 0 else self.steps[number - 2 : number]
+        following = self.steps[number : number + 2]
+        if len(steady) < 2 or (number and not _is_steady(following)):
+            return None
+        usual = steady[-1]
+        if not _is_steady(steady) or not usual.any():
+            return None
+        step = self.steps[number]
+        if _rms(step) > SPIKE * _rms(usual):
+            return "frames are missing or out of order"
+        ratio = float(np.sum(step * usual) / np.sum(usual * usual))
+        if _rms(step - ratio * usual) > STEADY * _rms(step):
+            return None
+        if ratio == 0.0:
+            return "the frame is there twice" if number == 0 else None
+        if ratio > GAP:
+            return "frames are missing before it, or times are uneven"
+        return "times are uneven" if number and 0.0 < ratio * GAP < 1.0 else None
 
     def refuse_jumps(self, box: Box) -> None:
         """Refuse jumps across the box that no stated period explains."""
@@ -403,14 +476,32 @@ class _Motion:
                 )
 
     def refuse_velocities(self, frame_interval: float) -> None:
-        """Refuse velocities of another size or direction than the motion.
+        """Refuse velocities of another size, direction or frame than the motion.
 
         A particle turns between two frames, so the limits are wide.
         """
         if not self.velocities:
             return
-        velocity = np.array(self.velocities)
+        velocity = np.array(self.velocities)[1:]
         motion = np.array(self.steps) / frame_interval
+        if len(motion) > 4:
+            middle = velocity[1:-2]
+            # of the motion from one frame before to one after, by half frames
+            centres = [
+                motion[:-3] + motion[1:-2],
+                2.0 * motion[1:-2],
+                motion[1:-2] + motion[2:-1],
+                2.0 * motion[2:-1],
+                motion[2:-1] + motion[3:],
+            ]
+            errors = [_rms(middle - 0.5 * centre) for centre in centres]
+            best = int(np.argmin(errors))
+            if best in (0, 4) and errors[best] < LATE * min(errors[1:4]):
+                raise DataError(
+                    f"{self.name}: velocities are those one frame "
+                    f"{'after' if best else 'before'}; mend them, or leave velocities "
+                    "out: they are then differences of positions"
+                )
         speed = _rms(velocity)
         size = _rms(motion)
         if size == 0.0 and speed == 0.0:
@@ -446,6 +537,22 @@ class _Motion:
         error = 0.41 * quantum / largest  # of a difference of two rounded numbers
         return [f"{text}: velocities are wrong by {error:.0%}; write more digits"]
 
+    def describe_unmoved(self, last: Floats) -> list[str]:
+        """Return a note on some particles that stay at one place while others move.
+
+        Args:
+            last: positions in the last frame [length], [particle, axis].
+        """
+        unmoved = np.flatnonzero(self.is_unmoved)
+        if not len(unmoved) or self.is_unmoved.all():
+            return []
+        place = np.round(last[unmoved[0]], 6).tolist()
+        return [
+            f"{self.name}: {len(unmoved)} of {len(last)} particles never move, as "
+            f"particle {unmoved[0]} at {place}: leave them out if they are padding; "
+            "give them the kind wall if they are one"
+        ]
+
     def describe_rest(self) -> list[str]:
         """Return a note on frames at the end in which nothing moves."""
         resting_count = 0
@@ -458,6 +565,11 @@ class _Motion:
         if resting_count < 2:
             return []
         return [f"{self.name}: the last {resting_count} frames equal the one before"]
+
+
+def _is_steady(steps: Sequence[Floats]) -> bool:
+    """Return whether steps are the same, one or more."""
+    return _rms(steps[-1] - steps[0]) <= STEADY * _rms(steps[0])
 
 
 def _rms(vectors: Floats) -> float:
@@ -484,11 +596,13 @@ def _resolution(values: NDArray[np.floating]) -> float:
 def find_shared_frames(
     judgements_of: Mapping[str, Sequence[Judgement]],
 ) -> list[str]:
-    """Refuse a trajectory, or half of one, that two subsets share; note a few frames.
+    """Refuse a trajectory, or half of one, that two subsets share; note what may be.
 
     Two frames are the same if the moments of their positions are, in whatever order
     their particles stand. Frames in which nothing moved since the one before do not
-    count.
+    count. Notes tell of a few shared frames, of frames that are the same in other
+    digits, moved, turned, mirrored or scaled, and of a trajectory that goes on where
+    another one ends.
 
     Args:
         judgements_of: the trajectories of each subset.
@@ -496,8 +610,6 @@ def find_shared_frames(
     Raises:
         DataError: a model would be tested on what it was trained on.
     """
-    from scipy.spatial import cKDTree
-
     judgements: list[Judgement] = []
     subsets: list[str] = []
     for subset, members in judgements_of.items():
@@ -505,72 +617,118 @@ def find_shared_frames(
         subsets += [subset] * len(members)
     # that of the smallest: others may be in another unit
     extent = min(judgement.extent for judgement in judgements) or 1.0
-    frames_of = [_moving_frames(judgement, extent) for judgement in judgements]
-    shared: dict[tuple[int, int], int] = {}  # frames by trajectory and earlier one
-    for subset in list(judgements_of)[1:]:
-        start = subsets.index(subset) if subset in subsets else 0
+    frames = [_scaled_moments(judgement, extent) for judgement in judgements]
+    moving = []
+    shapes = []
+    for judgement, moments in zip(judgements, frames, strict=True):
+        has_moved = np.ones(len(moments), bool)
+        has_moved[1:] = (moments[1:] != moments[:-1]).any(axis=1)
+        moving.append(moments[has_moved])
+        shapes.append(judgement.shapes[has_moved])
+
+    same = _count_shared(moving, subsets, SAME)
+    alike = _count_shared(moving, subsets, ALIKE)
+    similar = _count_shared(shapes, subsets, ALIKE)
+    following = _find_continued(frames, subsets)
+    notes = []
+    for pair in sorted({*alike, *similar, *following}):
+        one, other = [judgements[number] for number in pair]
+        first, second = [f"{judgements[n].name} ({subsets[n]})" for n in pair]
+        shortest = min(len(one.moments), len(other.moments))
+        count = same.get(pair, 0)
+        text = f"{first} and {second} share {max(count, alike.get(pair, 0))} frames"
+        if count >= 0.5 * shortest:
+            raise DataError(
+                f"{text} of {shortest}: a model would be tested on what it was trained "
+                "on; give each run, and all pieces of a run, to one subset"
+            )
+        if alike.get(pair, 0) > 1:
+            notes.append(f"{text}, at least nearly: are they one run?")
+        elif similar.get(pair, 0) >= 0.5 * shortest:
+            notes.append(
+                f"{similar[pair]} frames of {first} are those of {second}, moved, "
+                "turned, mirrored or scaled: are they one run?"
+            )
+        elif pair in following:
+            notes.append(
+                f"one of {first} and {second} goes on where the other ends: are they "
+                "one run?"
+            )
+    return notes
+
+
+def _scaled_moments(judgement: Judgement, extent: float) -> Floats:
+    """Return the moments over the extent, [frame, moment]."""
+    dimension = len(judgement.low)
+    powers = np.full(judgement.moments.shape[1], 2.0)
+    powers[:dimension] = 1.0
+    powers[-dimension:] = 3.0
+    return np.asarray(judgement.moments / extent**powers)
+
+
+def _count_shared(
+    frames_of: Sequence[Floats], subsets: Sequence[str], tolerance: float
+) -> dict[tuple[int, int], int]:
+    """Return how many frames of a trajectory are in one of an earlier subset.
+
+    Keys are the numbers of the earlier trajectory and of the other.
+    """
+    from scipy.spatial import cKDTree
+
+    shared: dict[tuple[int, int], int] = {}
+    for subset in dict.fromkeys(subsets):
+        start = subsets.index(subset)
         if start == 0:
             continue
         earlier = np.concatenate(frames_of[:start])
         owners = np.repeat(np.arange(start), list(map(len, frames_of[:start])))
         tree = cKDTree(earlier)
         nearest = np.arange(1, min(MOST_COPIES, len(earlier)) + 1)
-        for number in range(start, start + len(judgements_of[subset])):
+        for number in range(start, start + subsets.count(subset)):
             found = tree.query(frames_of[number], k=nearest, p=np.inf)
             distances, rows = map(np.asarray, found)
             for near, row in zip(distances, rows, strict=True):
-                for owner in set(owners[row[near < SAME]].tolist()):
+                for owner in set(owners[row[near < tolerance]].tolist()):
                     shared[owner, number] = shared.get((owner, number), 0) + 1
-    notes = []
-    for (first, second), count in sorted(shared.items()):
-        one = judgements[first]
-        other = judgements[second]
-        text = (
-            f"{one.name} ({subsets[first]}) and {other.name} ({subsets[second]}) share "
-            f"{count} frames"
-        )
-        shortest = min(len(one.moments), len(other.moments))
-        if count >= 0.5 * shortest:
-            raise DataError(
-                f"{text} of {shortest}: a model would be tested on what it was trained "
-                "on; give each run, and all pieces of a run, to one subset"
-            )
-        if count > 1:
-            notes.append(f"{text}: are they one run?")
-    return notes
+    return shared
 
 
-def _moving_frames(judgement: Judgement, extent: float) -> Floats:
-    """Return the moments of frames that differ from the one before, over the extent."""
-    moments = judgement.moments
-    dimension = len(judgement.low)
-    powers = np.full(moments.shape[1], 2.0)
-    powers[:dimension] = 1.0
-    powers[-dimension:] = 3.0
-    has_moved = np.ones(len(moments), bool)
-    has_moved[1:] = (moments[1:] != moments[:-1]).any(axis=1)
-    return np.asarray(moments[has_moved] / extent**powers)
+def _find_continued(
+    frames_of: Sequence[Floats], subsets: Sequence[str]
+) -> set[tuple[int, int]]:
+    """Return pairs of trajectories, of two subsets, of which one continues the other.
+
+    Its first frame is where the last two frames of the other lead.
+    """
+    starts = np.array([frames[0] for frames in frames_of])
+    last_steps = np.array([frames[-1] - frames[-2] for frames in frames_of])
+    ends = np.array([frames[-1] for frames in frames_of]) + last_steps
+    sizes = np.abs(last_steps).max(axis=1)
+    pairs = set()
+    for number, end in enumerate(ends):
+        distance = np.abs(starts - end).max(axis=1)
+        for other in np.flatnonzero(distance < STEADY * sizes[number]).tolist():
+            if subsets[other] != subsets[number]:
+                pairs.add((min(number, other), max(number, other)))
+    return pairs
 
 
 def find_shift(predicted: Floats, truth: Floats, box: Box) -> int:
-    """Return by how many frames a prediction is late (-1) or early (1), else 0.
+    """Return by how many frames a prediction is late (-2, -1) or early (1, 2), else 0.
 
-    It is shifted if it fits the true frames before, or after, far better than its own.
+    It is shifted if it fits other true frames far better than its own.
 
     Args:
         predicted: positions of the first predicted frames [length], [frame, particle,
             axis].
-        truth: true positions of the same frames, of the one before and of the one
-            after them.
+        truth: true positions of the same frames, and of as many frames before as after
+            them.
         box: the box of the particles.
     """
     count = len(predicted)
+    margin = (len(truth) - count) // 2
     errors = []
-    for start in range(3):
+    for start in range(2 * margin + 1):
         errors.append(_rms(box.displacement(truth[start : start + count], predicted)))
-    if errors[1] == 0.0:
-        return 0
     best = int(np.argmin(errors))
-    if errors[best] < LATE * errors[1]:
-        return best - 1
-    return 0
+    return best - margin if errors[best] < LATE * errors[margin] else 0

@@ -68,6 +68,9 @@ class _Judged:
     interval: float  # time between two frames, as the user or the file says [s]
     particles: int
     axes: tuple[int, ...]  # components that are not constant
+    frames: int
+    states_kinds: bool  # whether the file says which materials there are
+    has_velocity: bool
     stated: Mapping[str, Any]  # options that the file states
 
 
@@ -200,8 +203,10 @@ def _list_subsets(
                 listings[subset] = list_sources(path, reading)
                 if path.is_file():
                     digests.append(f"{path.name} {file_sha256(path)[:16]}")
-            if (folder / "force.py").is_file():
-                listings["train"].skipped.append("force.py, a program")
+            known = ["metadata.json", *(path.name for (path,) in parts.values())]
+            for entry in sorted(folder.iterdir()):
+                if entry.name not in known and not entry.name.startswith("."):
+                    listings["train"].skipped.append(entry.name)
             return listings, read_metadata(folder), ", ".join(digests)
 
     found: list[Source] = []
@@ -316,6 +321,9 @@ def _judge(
         interval=interval,
         particles=len(trajectory.material),
         axes=trajectory.axes,
+        frames=trajectory.frames,
+        states_kinds=trajectory.states_kinds,
+        has_velocity="velocity" in trajectory.dataset,
         stated={"bounds": stated.bounds, "periodic": stated.periodic},
     )
 
@@ -404,6 +412,8 @@ def _complete(
             differing = f"the dimensions {first.axes} and {member.axes}"
         elif member.stated != first.stated:
             differing = f"the boxes {first.stated} and {member.stated}"
+        elif member.states_kinds != first.states_kinds:
+            differing = "materials in one of them only"
         elif not math.isclose(member.interval, first.interval, rel_tol=0.01):
             differing = f"frames {first.interval:.6g} and {member.interval:.6g} s apart"
         if differing is not None:
@@ -412,8 +422,30 @@ def _complete(
                 "import them apart"
             )
     notes = []
+    with_velocity = [member for member in members if member.has_velocity]
+    if 0 < len(with_velocity) < len(members):
+        notes.append(
+            f"{with_velocity[0].judgement.name} has velocities, as "
+            f"{len(with_velocity)} of {len(members)} trajectories; those of others are "
+            "differences of positions"
+        )
+    shortest = min(judged["valid"] + judged["test"], key=lambda one: one.frames)
+    if description.horizon is None and shortest.frames < max(m.frames for m in members):
+        notes.append(
+            f"{shortest.judgement.name} has {shortest.frames} frames, others more: "
+            "frames after these are not predicted; --valid and --test, or names, put "
+            "short trajectories into train"
+        )
     judgements = [member.judgement for member in members]
     extent = _box_around(judgements)
+    middles = np.array([0.5 * (one.low + one.high) for one in judgements])
+    distance = np.linalg.norm(middles - np.median(middles, axis=0), axis=1)
+    farthest = int(np.argmax(distance))
+    if distance[farthest] > 2.0 * judgements[farthest].extent:
+        notes.append(
+            f"{judgements[farthest].name} lies {distance[farthest]:.3g} away from the "
+            "other trajectories: have all the same origin?"
+        )
     bounds = first.stated["bounds"]
     periodic = first.stated["periodic"]
     box = extent

@@ -34,7 +34,8 @@ NAMES = {
 """Variables, and the names that files have for them, in the order of preference."""
 
 SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "second": 1.0, "ms": 1e-3, "us": 1e-6}
-SECONDS |= {"ns": 1e-9, "ps": 1e-12, "min": 60.0, "h": 3600.0, "1": 1.0, "": 1.0}
+SECONDS |= {"ns": 1e-9, "ps": 1e-12, "min": 60.0, "minutes": 60.0, "h": 3600.0}
+SECONDS |= {"hours": 3600.0, "d": 86400.0, "days": 86400.0, "1": 1.0, "": 1.0}
 """Seconds in a unit of time."""
 
 UNEVEN = 0.01
@@ -64,6 +65,7 @@ class Trajectory:
     wall_velocity: NDArray[np.float64] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)  # options by name
     parameters: Mapping[str, object] = field(default_factory=dict)
+    states_kinds: bool = False  # whether the file says which materials there are
     axes: tuple[int, ...] = ()  # components of the file that are kept
     notes: tuple[str, ...] = ()
 
@@ -206,6 +208,7 @@ def name_trajectory(
         is_kept=is_kept,
         interval=_find_interval(dataset, variables, name),
         wall_velocity=walls,
+        states_kinds="kind" in variables,
         stated=stated,
         parameters=dataset.attrs.get("parameters", {}),
         notes=(*notes, *kind_note),
@@ -292,6 +295,9 @@ def _find_interval(
     Whole numbers without a unit are numbers of steps: they must be even.
     """
     interval = None
+    for word in NAMES["interval"]:
+        if word in dataset.attrs:
+            interval = float(dataset.attrs[word])
     if "interval" in variables and dataset[variables["interval"]].size == 1:
         interval = float(dataset[variables["interval"]])
     if "time" not in variables or dataset[variables["time"]].dims != ("time",):
@@ -301,7 +307,12 @@ def _find_interval(
     if values.dtype.kind in "mM":
         values = (values - values[0]) / np.timedelta64(1, "s")
     unit = str(time.attrs.get("units", "")).split(" since ")[0]
-    times = values.astype(np.float64) * SECONDS.get(unit, 1.0)
+    if unit not in SECONDS:
+        raise DataError(
+            f"{name}: times are in {unit!r}; give them in a unit of "
+            f"{', '.join(filter(None, SECONDS))}, or without a unit"
+        )
+    times = values.astype(np.float64) * SECONDS[unit]
     steps = np.diff(times)
     usual = float(np.median(steps))
     tolerance = UNEVEN * usual + 4.0 * float(np.spacing(np.abs(values).max()))

@@ -112,8 +112,15 @@ def list_sources(path: Path, options: Reading) -> Listing:
         if len(files) > 1 and all(map(_holds_one_frame, files)):
             return Listing(sources=[_series(path, files)], skipped=skipped)
         sources = []
+        faults = []
         for file in files:
-            sources += list_sources(file, options).sources
+            try:
+                sources += list_sources(file, options).sources
+            except UnreadableFileError as error:
+                faults.append(str(error).removeprefix(f"{path}/"))
+        if faults:
+            others = f"; not read are {', '.join(skipped)}" if skipped else ""
+            raise UnreadableFileError(f"{path}: {', '.join(faults)}{others}")
         return Listing(sources=sources, skipped=skipped)
 
     sources = []

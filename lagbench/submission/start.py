@@ -121,14 +121,15 @@ def check_start(
 
 
 def check_shift(predictions: Predictions, truth: Truth, issues: IssueCollector) -> None:
-    """Flag predictions that are one frame late, or early, in every scenario."""
+    """Flag predictions that are a frame or two late, or early, in every scenario."""
     first = predictions.header.frames[0]
-    count = min(SHIFT_FRAMES, truth.size.task.horizon - 1)
+    margin = 2
+    count = min(SHIFT_FRAMES, truth.size.task.horizon - margin)
     scored = set(truth.size.scored_scenarios).intersection(predictions.header.scenarios)
     shifts = set()
     for scenario in sorted(scored) if count > 1 else ():
         predicted = predictions.frames(scenario, first, count).astype(np.float64)
-        recorded = truth.frames(scenario, first - 1, first + count + 1)
+        recorded = truth.frames(scenario, first - margin, first + count + margin)
         true_frames = recorded.astype(np.float64)
         shift = 0
         if np.isfinite(predicted).all():
@@ -137,13 +138,14 @@ def check_shift(predictions: Predictions, truth: Truth, issues: IssueCollector) 
         if shifts != {shift} or shift == 0:
             shifts = {0}
             break
-    if shifts in ({-1}, {1}):
-        late = shifts == {-1}
+    if shifts and shifts != {0}:
+        shift = shifts.pop()
+        frames = "one frame" if abs(shift) == 1 else f"{abs(shift)} frames"
         issues.warning(
             "shifted",
-            f"predictions are one frame {'late' if late else 'early'}: in every "
-            f"scenario they fit the true frames {'before' if late else 'after'} far "
-            "better than their own",
+            f"predictions are {frames} {'late' if shift < 0 else 'early'}: in every "
+            f"scenario they fit the true frames {'before' if shift < 0 else 'after'} "
+            "far better than their own",
             where=f"frames {first} to {first + count - 1}",
             expected="the frame after the last given one first",
             got="a rollout that begins with another one",

@@ -340,12 +340,12 @@ def test_each_trajectory_has_its_own_spacing(
         assert area == pytest.approx(0.36, rel=0.05)
 
 
-@pytest.mark.parametrize("shift", [-1, 0, 1])
+@pytest.mark.parametrize("shift", [-2, -1, 0, 1, 2])
 def test_a_prediction_that_is_late_or_early_is_seen(shift: int) -> None:
-    truth = vortex(0, frames=12).astype(np.float64)
+    truth = vortex(0, frames=14).astype(np.float64)
     frames = np.arange(6, 11) + shift
     noise = np.random.default_rng(0).normal(0, 1e-4, (5, 144, 2))
-    assert find_shift(truth[frames] + noise, truth[5:12], UNIT_SQUARE) == shift
+    assert find_shift(truth[frames] + noise, truth[4:13], UNIT_SQUARE) == shift
 
 
 def test_a_radius_of_many_neighbours_is_noted(tmp_path: Path) -> None:
@@ -358,6 +358,198 @@ def test_a_radius_of_many_neighbours_is_noted(tmp_path: Path) -> None:
     note = next(note for note in own.notes if "neighbours" in note)
     assert "edges" in note
     assert "two spacings are 0.03" in note
+
+
+def dataset_of(position: np.ndarray, **arrays: Any) -> xr.Dataset:
+    return xr.Dataset({"position": (("time", "particle", "space"), position), **arrays})
+
+
+def adopt_datasets(
+    folder: Path, make: Callable[[int], xr.Dataset], **options: Any
+) -> LocalSplit:
+    """Adopt four datasets; the last is for test."""
+    all_options = {"radius": 0.1, "frame_interval": 0.1, **options}
+    datasets = [make(number) for number in range(4)]
+    return adopt(datasets, output=folder / "own", **all_options)
+
+
+def changed_from_frame_8(change: Callable[[np.ndarray], np.ndarray]) -> Any:
+    def change_end(position: np.ndarray) -> np.ndarray:
+        return np.concatenate([position[:8], change(position[8:])])
+
+    return change_end
+
+
+def park_three(position: np.ndarray) -> np.ndarray:
+    return np.concatenate([0 * position[:, :3] + [[0, 0], [1, 0], [0, 1]], position], 1)
+
+
+FRAMES = np.arange(16)
+
+REFUSED_MOTIONS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "halves of the rows exchanged": (
+        changed_from_frame_8(lambda end: np.roll(end, 72, axis=1)),
+        "frame 8",
+    ),
+    "rows rolled by one": (
+        changed_from_frame_8(lambda end: np.roll(end, 1, axis=1)),
+        "frame 8",
+    ),
+    "x and y exchanged": (changed_from_frame_8(lambda end: end[..., ::-1]), "frame 8"),
+    "last frame reversed": (
+        lambda run: np.concatenate([run[:-1], run[-1:, ::-1]]),
+        "frame 15",
+    ),
+    "frames sorted as text": (lambda run: run[sorted(FRAMES, key=str)], "frame 2"),
+    "first frame twice": (lambda run: run[[0, *range(15)]], "frame 1.*twice"),
+    "frame twice": (lambda run: run[[*range(9), *range(8, 15)]], "frame 9.*twice"),
+    "frame missing": (lambda run: np.delete(run, 8, axis=0), "frame 8.*missing"),
+    "second frame missing": (lambda run: np.delete(run, 1, axis=0), "frame 1.*missing"),
+    "restarted": (lambda run: run[[*range(8), *range(6, 14)]], "out of order"),
+    "frames skipped from 8 on": (
+        lambda run: run[[*range(8), *range(9, 16, 2)]],
+        "frame 8.*uneven",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED_MOTIONS)
+def test_a_wrong_motion_is_refused_at_its_frame(tmp_path: Path, name: str) -> None:
+    change, text = REFUSED_MOTIONS[name]
+    with pytest.raises(DataError, match=text):
+        adopt_datasets(tmp_path, lambda number: dataset_of(change(vortex(number))))
+
+
+def test_a_body_that_flies_fast_is_no_exchange_of_axes(tmp_path: Path) -> None:
+    """Its step is two spacings in each frame, alike for all particles."""
+    flight = 0.1 * FRAMES[:, None, None] * np.array([1, 0])
+    adopt_datasets(tmp_path, lambda number: dataset_of(vortex(number) + flight))
+
+
+COPIES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "mirrored": lambda run: [1, 0] + run * [-1, 1],
+    "moved": lambda run: run + np.float32(0.05),
+    "x and y exchanged": lambda run: run[..., ::-1],
+    "turned": lambda run: np.stack([1 - run[..., 1], run[..., 0]], axis=-1),
+    "scaled": lambda run: 3 * run,
+    "in half precision": lambda run: run.astype(np.float16).astype(np.float32),
+}
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_a_changed_copy_in_another_subset_is_noted(tmp_path: Path, name: str) -> None:
+    own = adopt_datasets(
+        tmp_path,
+        lambda number: dataset_of(
+            vortex(number) if number < 3 else COPIES[name](vortex(0))
+        ),
+    )
+    assert any("are they one run" in note for note in own.notes)
+
+
+def test_a_run_that_goes_on_in_another_subset_is_noted(tmp_path: Path) -> None:
+    """Also where motion is not steady, so that no frame of it comes again."""
+    rng = np.random.default_rng(0)
+    fall = (
+        rng.uniform(0, 1, (4, 144, 2))
+        - [0, 0.001] * np.arange(40)[:, None, None, None] ** 2
+    )
+
+    def make(number: int) -> xr.Dataset:
+        run = fall[:, 0] if number in (0, 3) else fall[:, number]
+        return dataset_of(run[24:] if number == 3 else run[8:24])
+
+    own = adopt_datasets(tmp_path, make)
+    assert any("goes on where the other ends" in note for note in own.notes)
+
+
+def test_runs_from_one_lattice_are_no_copies(tmp_path: Path) -> None:
+    """Their particles differ by a thousandth of the box at most."""
+    own = adopt_datasets(
+        tmp_path,
+        lambda number: dataset_of(
+            vortex(0, side=60)
+            + np.random.default_rng(number).uniform(-1e-3, 1e-3, (3600, 2))
+        ),
+    )
+    assert own.scenarios["test"] == 1
+
+
+@pytest.mark.parametrize(
+    ("dataset", "text"),
+    [
+        (lambda run: dataset_of(run).assign_attrs(dt=0.02), "0.02 s apart"),
+        (
+            lambda run: dataset_of(
+                run, time=("time", 1.0 * FRAMES, {"units": "fortnight"})
+            ),
+            "fortnight",
+        ),
+        (
+            lambda run: dataset_of(run, time=("time", 0.1 * FRAMES**1.01)),
+            r"frame \d+: its time",
+        ),
+        (
+            lambda run: dataset_of(
+                run,
+                velocity=(
+                    ("time", "particle", "space"),
+                    np.roll(np.gradient(run, 0.1, axis=0), 1, axis=0),
+                ),
+            ),
+            "velocities are those one frame before",
+        ),
+    ],
+)
+def test_what_a_dataset_says_of_itself_is_compared(
+    tmp_path: Path, dataset: Callable[[np.ndarray], xr.Dataset], text: str
+) -> None:
+    with pytest.raises(LagbenchError, match=text):
+        adopt_datasets(tmp_path, lambda number: dataset(vortex(number)))
+
+
+def test_one_trajectory_does_not_stand_for_all(tmp_path: Path) -> None:
+    """Materials in one, velocities in one, a short one and one far away are named."""
+
+    def in_run_1(name: str, dims: tuple[str, ...]) -> Callable[[int], xr.Dataset]:
+        def make(number: int) -> xr.Dataset:
+            dataset = dataset_of(vortex(number))
+            if number == 1:
+                dataset[name] = (dims, np.gradient(dataset.position, 0.1, axis=0))
+            return dataset
+
+        return make
+
+    def with_material(number: int) -> xr.Dataset:
+        material = {} if number else {"material": ("particle", np.ones(144, int))}
+        return dataset_of(vortex(number), **material)
+
+    with pytest.raises(UsageError, match="materials in one of them only"):
+        adopt_datasets(tmp_path, with_material)
+    makers = (
+        in_run_1("velocity", ("time", "particle", "space")),
+        lambda number: dataset_of(vortex(number, frames=16 - 4 * (number == 3))),
+        lambda number: dataset_of(vortex(number) + 10 * (number == 3)),
+    )
+    texts = ("1 of 4 trajectories", "has 12 frames, others more", "away from the other")
+    for number, (make, text) in enumerate(zip(makers, texts, strict=True)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        assert any(text in note for note in adopt_datasets(folder, make).notes)
+
+
+def test_particles_that_never_move_are_noted(tmp_path: Path) -> None:
+    own = adopt_datasets(
+        tmp_path, lambda number: dataset_of(park_three(vortex(number)))
+    )
+    assert any("3 of 147 particles never move, as particle 0" in n for n in own.notes)
+
+
+def test_what_lies_beside_the_subsets_is_named(tmp_path: Path) -> None:
+    for number, name in enumerate(("train", "valid", "test", "extra")):
+        np.savez(tmp_path / f"{name}.npz", position=vortex(number))
+    own = adopt(tmp_path, output=tmp_path / "own", frame_interval=0.1)
+    assert "not read: extra.npz" in own.notes
 
 
 def test_every_refusal_is_an_error_of_ours(tmp_path: Path) -> None:
