@@ -21,7 +21,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import torch
@@ -50,9 +50,7 @@ class Symmetry(enum.StrEnum):
     """All eight images of the square, or 48 of the cube: see :func:`check_symmetry`."""
 
 
-def check_symmetry(
-    symmetry: object, size: Size, *, find_forcing: Callable[[], Collection[str]]
-) -> None:
+def check_symmetry(symmetry: object, size: Size, forcing: Collection[str]) -> None:
     """Refuse mirror images that are no motion of the split.
 
     A split whose description names neither gravity nor a fringe, as that of an imported
@@ -61,8 +59,7 @@ def check_symmetry(
     Args:
         symmetry: the images that are asked for.
         size: the data set.
-        find_forcing: returns what drives the flow, by the names in batches. It reads
-            the data, so it is called only where the answer counts.
+        forcing: what drives the flow, by the names in batches.
 
     Raises:
         UsageError: mirror images are asked for where a stream flows along x; or all
@@ -92,7 +89,7 @@ def check_symmetry(
             "set model.symmetry=mirror",
             where="model.symmetry",
         )
-    if "body_force" in find_forcing():
+    if "body_force" in forcing:
         raise UsageError(
             f"a force acts on layers along y in {size.split}: y cannot change places "
             f"with another axis; set model.symmetry=mirror",
@@ -151,8 +148,7 @@ def mirror_field(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> T
     """
     channel_matrix: Tensor = torch.block_diag(*channels)  # type: ignore[no-untyped-call]
     channel_matrix = channel_matrix.to(field)
-    with torch.autocast(field.device.type, enabled=False):
-        image = torch.einsum("dc,wc...->wd...", channel_matrix, field)
+    image = torch.einsum("dc,wc...->wd...", channel_matrix, field)
 
     # New axis i is that old axis where row i of the matrix is not 0.
     old_axes = matrix.abs().argmax(dim=1)
@@ -383,7 +379,7 @@ def strain_matrix(matrix: Tensor) -> Tensor:
 
 
 def _multiply(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Return products of matrices and vectors; autocast would round matmul's."""
+    """Return products of matrices and vectors."""
     products = matrix * vector.unsqueeze(-2)
     return products.sum(dim=-1)
 

@@ -84,15 +84,10 @@ class Baseline(nn.Module):
             batch lies, as solvers in NumPy do. Predictions then stay on the CPU.
         closed_form: whether the model is fitted as a whole instead of trained step by
             step. It then has a method ``fit`` beside the contract. ``fit(scenarios)``
-            gets an iterator over the positions of each scenario of train [length],
-            shape [frame, particle, axis], as NumPy arrays. It sets buffers of the model
-            and returns numbers to log, by name. Nothing calls :meth:`forward`.
-        fits_batches: whether a closed form is called as ``fit(scenarios, *, count)``,
-            with batches. Each batch is a whole scenario, a single window of all its
-            frames, with what its file states beside the positions. ``count(n)`` reports
-            n units of work after the reading, for the progress bar; the attribute or
-            property ``evaluations`` states their number beforehand. An option
-            ``scenarios`` of the model bounds how many scenarios are read.
+            gets an iterator over the scenarios of train. Each is a batch of a single
+            window of all frames, with what its file states beside the positions. The
+            method sets buffers of the model and returns numbers to log, by name.
+            Nothing calls :meth:`forward`.
 
     Args:
         options: the model's options.
@@ -105,7 +100,6 @@ class Baseline(nn.Module):
     any_box: ClassVar[bool] = False
     computes_on_cpu: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
-    fits_batches: ClassVar[bool] = False
 
     def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()
@@ -168,21 +162,6 @@ class Baseline(nn.Module):
     def build(cls, options: Mapping[str, object], info: DatasetInfo) -> Self:
         """Return an untrained model; options are checked by pydantic."""
         return cls(cls.Options.model_validate(dict(options)), info)
-
-    def adapt_weights(
-        self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
-    ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Return the weights that a training starts from, and their options.
-
-        A model may change both to fit itself; by default they stay as they are. The
-        training refuses weights of other shapes than this model's, and returned options
-        that differ in one of ``of_weights``.
-
-        Args:
-            weights: parameters and buffers by name, of a model with those options.
-            options: plain values by name, without those of the training.
-        """
-        return weights, options
 
     @property
     def forcing_seen(self) -> frozenset[str] | None:

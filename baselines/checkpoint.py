@@ -32,6 +32,7 @@ from lagbench.errors import (
     check_regular,
 )
 from lagbench.submission.budget import Budget, parse_budget
+from lagbench.submission.provenance import StartWeights, TrainingProvenance
 
 from .baseline import Baseline, DatasetInfo
 from .catalogue import find
@@ -39,6 +40,7 @@ from .dataset_info import read_dataset_info
 
 SUFFIX = ".safetensors"
 KEY = "lagbench"  # of the JSON text in the header
+START_DIGITS = 12  # digits of a SHA-256 that provenance names
 OPTIMIZER = "optimizer/"  # begins the names of the optimiser's tensors
 
 
@@ -74,6 +76,35 @@ class Checkpoint:
     def seed(self) -> int:
         """Seed of the training."""
         return int(self.recipe.get("training", {}).get("seed", 0))
+
+    def provenance(self) -> TrainingProvenance:
+        """Return the training behind the weights.
+
+        Raises:
+            UnreadableFileError: the record of the training is damaged.
+        """
+        start = self.recipe.get("start")
+        start_weights = None
+        try:
+            if start:
+                start_weights = StartWeights(
+                    recipe=start["recipe"], weights=start["sha256"][:START_DIGITS]
+                )
+            return TrainingProvenance(
+                split=self.info.split,
+                size=self.info.size,
+                subsets=tuple(
+                    self.recipe.get("training", {}).get("windows", ("train",))
+                ),
+                recipe=str(self.recipe.get("name")),
+                step=self.training.get("step", 0),
+                overrides=tuple(self.recipe.get("settings", ())),
+                start=start_weights,
+            )
+        except (ValidationError, TypeError, KeyError) as error:
+            raise UnreadableFileError(
+                f"the weights record a damaged training: {error!r}"
+            ) from error
 
 
 class _Header(BaseModel):

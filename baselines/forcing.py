@@ -19,15 +19,6 @@ from lagbench.tensors import TensorBox
 from .baseline import Batch, DatasetInfo
 from .graph import safe_length
 
-__all__ = [
-    "ForcingFeatures",
-    "coming_force",
-    "force_at",
-    "obstacle_features",
-    "require_force",
-    "skip_frames",
-]
-
 
 class ForcingFeatures(nn.Module):
     """The features of force and obstacle that a model asks for; none by default.
@@ -78,16 +69,19 @@ class ForcingFeatures(nn.Module):
         return frozenset(names)
 
     def coming_force(self, given: Batch) -> Tensor | None:
-        """Return the force from the next frame on; None where it is not seen.
+        """Return the force from the next frame on [length/frame^2].
 
-        See :func:`coming_force`.
+        The shape is [window, frame, layer, axis]; beyond the known frames the last one
+        stays. None where it is not seen.
 
         Raises:
             DataError: no force drives the flow.
         """
         if not self.body_force:
             return None
-        return coming_force(given, self.info)
+        force = require_force(given, self.info)
+        next_frame = min(given.frames, force.shape[1] - 1)
+        return force[:, next_frame:]
 
     def find_obstacle(self, given: Batch) -> Tensor | None:
         """Return centre and radius of each window's obstacle [length].
@@ -136,21 +130,6 @@ class ForcingFeatures(nn.Module):
         return torch.cat(parts, dim=1)
 
 
-def coming_force(given: Batch, info: DatasetInfo) -> Tensor:
-    """Return the force from the next frame on [length/frame^2].
-
-    The shape is [window, frame, layer, axis]. Beyond the known frames the last one
-    stays.
-
-    Raises:
-        DataError: no force drives the flow.
-    """
-    force = require_force(given, info)
-    known_frames = force.shape[1]
-    next_frame = min(given.frames, known_frames - 1)
-    return force[:, next_frame:]
-
-
 def require_force(given: Batch, info: DatasetInfo) -> Tensor:
     """Return the force towards each frame [length/frame^2].
 
@@ -167,24 +146,16 @@ def require_force(given: Batch, info: DatasetInfo) -> Tensor:
     return given.body_force * info.frame_interval**2
 
 
-def skip_frames(forcing: Tensor, count: int = 1, *, min_frames: int = 1) -> Tensor:
-    """Return the forcing from some frames later on; the last known one repeats.
+def skip_frames(forcing: Tensor, count: int = 1) -> Tensor:
+    """Return the forcing from some frames later on; the last known one stays.
 
     Args:
         forcing: what drives the flow in the coming frames, shape
             [window, frame, ...].
         count: frames to skip.
-        min_frames: least number of frames of the result.
     """
     last_frame = forcing.shape[1] - 1
-    skipped = min(count, last_frame)
-    later = forcing[:, skipped:]
-    missing_frames = min_frames - later.shape[1]
-    if missing_frames <= 0:
-        return later
-    last = forcing[:, -1:]
-    repeated = last.repeat_interleave(missing_frames, dim=1)
-    return torch.cat([later, repeated], dim=1)
+    return forcing[:, min(count, last_frame) :]
 
 
 def force_at(

@@ -30,11 +30,8 @@ from lagbench.tensors import TensorBox
 
 from . import baseline
 from .baseline import Baseline, Batch, DatasetInfo
-from .deviations import replace_zeros, root_mean_square
-from .forcing import ForcingFeatures, require_force, skip_frames
+from .deviations import replace_zeros
 from .graph import MATERIALS
-
-OBSTACLE_REACH = 3.0  # how far a particle sees an obstacle's surface [radius]
 
 
 class FrameState(nn.Module):
@@ -163,13 +160,6 @@ class FrameWindow:
     # the last standardised states [1], shape [window, frame, particle, 2 axis]
     state: Tensor
     material: Tensor  # material of each particle, shape [window, particle]
-    # force on layers along y [length/frame^2], from the frame after the first state on,
-    # shape [window, frame, layer, axis]: as many frames as states, or more. None where
-    # the model does not see it.
-    body_force: Tensor | None = None
-    # centre and radius of each window's obstacle [length], shape [window, axis + 1];
-    # None where the model does not see it
-    obstacle: Tensor | None = None
 
 
 class FrameModel(Baseline):
@@ -225,9 +215,7 @@ class FrameModel(Baseline):
         first_input = -1 - self.inputs
         inputs = window.state[:, first_input:-1]
         noisy_inputs = self.add_noise(inputs, generator)
-        noisy_window = FrameWindow(noisy_inputs, window.material)
-        noisy_window = self.add_forcing(noisy_window, batch, batch.frames - 2)
-        predicted = self.next_state(noisy_window)
+        predicted = self.next_state(FrameWindow(noisy_inputs, window.material))
         return truth, predicted
 
     def _standardise(self, batch: Batch) -> FrameWindow:
@@ -241,19 +229,6 @@ class FrameModel(Baseline):
         del generator
         return state
 
-    def add_forcing(
-        self, window: FrameWindow, batch: Batch, last_frame: int
-    ) -> FrameWindow:
-        """Return the window with what drives the flow: a model that sees it adds it.
-
-        Args:
-            window: states of consecutive frames.
-            batch: windows that hold these frames.
-            last_frame: number of the last of these frames in the batch.
-        """
-        del batch, last_frame
-        return window
-
     def start(self, given: Batch) -> FrameWindow:
         """Return the last states of the given frames.
 
@@ -265,8 +240,7 @@ class FrameModel(Baseline):
         first_state = state[:, :1]
         repeated = first_state.expand(-1, missing_frames, -1, -1)
         full_state = torch.cat([repeated, state], dim=1)
-        full_window = FrameWindow(full_state, window.material)
-        return self.add_forcing(full_window, given, given.frames - 1)
+        return FrameWindow(full_state, window.material)
 
     def advance(self, state: FrameWindow) -> tuple[FrameWindow, Tensor]:
         """Return the next window and positions [length], shape [particle, axis]."""
@@ -275,11 +249,7 @@ class FrameModel(Baseline):
         latest_states = state.state[:, 1:]
         new_frame = new_state.unsqueeze(1)
         states = torch.cat([latest_states, new_frame], dim=1)
-        force = state.body_force
-        if force is not None:
-            force = skip_frames(force, min_frames=states.shape[1])
-        window = replace(state, state=states, body_force=force)
-
+        window = replace(state, state=states)
         position = self.frame_state.position(new_state)
         position = position.flatten(0, 1)
         return window, position.to(torch.float32)
@@ -302,16 +272,12 @@ class FrameNetworkOptions(baseline.Options):
     """
 
     in_training = frozenset({"noise_std"})
-    of_weights = frozenset({"target", "body_force", "obstacle"})
+    of_weights = frozenset({"target"})
 
     # the next state, or its change in units of the change's deviation over train
     target: FrameTarget = FrameTarget.STATE
     # give the material as a fifth, constant feature of every particle
     material: bool = False
-    # give the force per unit mass at each particle on the way to the next frame
-    body_force: bool = False
-    # give distance and direction of an obstacle's surface, within three radii
-    obstacle: bool = False
     # of the noise on the states that training gives to the network [standardised]
     noise_std: float = Field(default=0.0, ge=0, allow_inf_nan=False)
 
@@ -325,16 +291,7 @@ class FrameNetwork(FrameModel):
 
     def __init__(self, options: FrameNetworkOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        acceleration_std = info.statistics["acceleration_std"]
-        self.forcing = ForcingFeatures(
-            info,
-            body_force=options.body_force,
-            obstacle=options.obstacle,
-            force_unit=root_mean_square(acceleration_std),
-            reach=OBSTACLE_REACH * info.radius,
-        )
-        state_features = 2 * info.box.dimension + options.material
-        self.input_features = state_features + self.forcing.count
+        self.input_features = 2 * info.box.dimension + options.material
         # the standard deviation of a state's change per frame [standardised]
         statistics = info.statistics
         change_of_state = {
@@ -363,70 +320,19 @@ class FrameNetwork(FrameModel):
         noise = self.options.noise_std * normal
         return state + noise
 
-    @property
-    def forcing_seen(self) -> frozenset[str]:
-        """What the options ask for."""
-        return self.forcing.names
-
-    def add_forcing(
-        self, window: FrameWindow, batch: Batch, last_frame: int
-    ) -> FrameWindow:
-        """Return the window with force and obstacle, where the options ask for them.
-
-        Each state has the force towards the frame after it. Where too few frames are
-        given, that of the first one repeats, as its state does.
-        """
-        force = None
-        if self.options.body_force:
-            known_force = require_force(batch, self.info)
-            last_known = known_force.shape[1] - 1
-            first_frame = last_frame - self.inputs + 1
-            end_frame = max(last_frame + 1, last_known)
-            frame = torch.arange(first_frame, end_frame, device=known_force.device)
-            following = frame.clamp(min=0) + 1
-            known_following = following.clamp(max=last_known)
-            force = known_force[:, known_following]
-        obstacle = self.forcing.find_obstacle(batch)
-        return replace(window, body_force=force, obstacle=obstacle)
-
     def network_inputs(self, window: FrameWindow) -> Tensor:
         """Return the network's inputs [1], shape [window, frame, particle, feature].
 
-        After the state comes the material, with 0 ... 3 mapped to -1 ... 1, and then
-        what is seen of force and obstacle.
+        After the state comes the material, with 0 ... 3 mapped to -1 ... 1.
         """
-        parts = [window.state]
-        frame_count = window.state.shape[1]
-        if self.options.material:
-            number = window.material.to(torch.float32)
-            step = 2.0 / (MATERIALS - 1)
-            material = number * step - 1.0
-            material = material[:, None, :, None]
-            parts.append(material.expand(-1, frame_count, -1, -1))
-        if self.forcing.count:
-            parts.append(self._forcing_inputs(window))
-        if len(parts) == 1:
+        if not self.options.material:
             return window.state
-        return torch.cat(parts, dim=-1)
-
-    def _forcing_inputs(self, window: FrameWindow) -> Tensor:
-        """Return what is seen of force and obstacle [1], [window, frame, particle, n].
-
-        The features of a frame are those of a window of its own.
-        """
-        position = self.frame_state.position(window.state)
-        windows, frame_count, particles, _ = position.shape
-        force = window.body_force
-        if force is not None:
-            force = force[:, :frame_count].flatten(0, 1)
-        obstacle = window.obstacle
-        if obstacle is not None:
-            obstacle = obstacle.repeat_interleave(frame_count, dim=0)
-        numbers = torch.arange(windows * frame_count, device=position.device)
-        sample = numbers.repeat_interleave(particles)
-        points = position.flatten(0, 2)
-        features: Tensor = self.forcing(points, sample, force, obstacle)
-        return features.view(windows, frame_count, particles, -1)
+        frame_count = window.state.shape[1]
+        number = window.material.to(torch.float32)
+        step = 2.0 / (MATERIALS - 1)
+        material = (number * step - 1.0)[:, None, :, None]
+        material = material.expand(-1, frame_count, -1, -1)
+        return torch.cat([window.state, material], dim=-1)
 
     def decode_state(self, output: Tensor, window: FrameWindow) -> Tensor:
         """Return the next state [1], shape [window, particle, 2 axis], from an output.

@@ -1,17 +1,28 @@
-"""What hybrids share: a solver whose coefficients are fitted as a whole, on train."""
+"""What hybrids share: a solver with coefficients that an earlier version fitted.
+
+Calibrated rows (:mod:`lagbench.references.calibrated`) have taken their place: nothing
+fits hybrids any more, but the committed weights predict as before.
+"""
 
 from __future__ import annotations
 
 from typing import ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from pydantic import ConfigDict
 from torch import Tensor
 
+from lagbench.data.box import Box
 from lagbench.errors import DataError, UsageError
 
-from .baseline import Baseline, Batch
+from .baseline import Baseline, Batch, Options
+
+
+class HybridOptions(Options):
+    """Base of the options; weights state those of their fit too."""
+
+    model_config = ConfigDict(extra="ignore")
 
 
 class Hybrid(Baseline):
@@ -22,31 +33,37 @@ class Hybrid(Baseline):
     """
 
     closed_form: ClassVar[bool] = True
-    fits_batches: ClassVar[bool] = True
     any_box: ClassVar[bool] = True
     computes_on_cpu: ClassVar[bool] = True
     largest: ClassVar[float]
 
     coefficients: Tensor
 
+    @classmethod
+    def check_data_set(
+        cls, split: str, size: str, box: Box, *, is_full_box: bool
+    ) -> None:
+        """Refuse a training.
+
+        Raises:
+            UsageError: always.
+        """
+        del box, is_full_box
+        raise UsageError(
+            f"{cls.method} is fitted no more; calibrated rows take its place: "
+            "python -m lagbench.scoring.calibrate",
+            where=f"{split} {size}",
+        )
+
     @property
     def history(self) -> int:
         """Given frames that the solver reads: the last two."""
         return 2
 
-    def forward(
-        self, batch: Batch, generator: torch.Generator | None = None
-    ) -> dict[str, Tensor]:
-        """Refuse: the coefficients are fitted as a whole, without steps.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(
-            f"{self.method} takes no training steps",
-            where=f"{type(self).__name__}.forward",
-            fix="train it with `lagbench train`",
-        )
+    def forward(self, batch: Batch, generator: object = None) -> dict[str, Tensor]:
+        """Return no loss: nothing is trained."""
+        del batch, generator
+        return {}
 
     def checked_coefficients(self) -> NDArray[np.float64]:
         """Return the coefficients [1], shape [coefficient].
@@ -57,10 +74,8 @@ class Hybrid(Baseline):
         values = self.coefficients.double().cpu().numpy()
         if not np.abs(values).max() <= self.largest:
             raise DataError(
-                f"the coefficients of the {self.method} are out of range",
-                where="coefficients of the weights",
-                expected=f"numbers from -{self.largest:g} to {self.largest:g}",
-                got=values.tolist(),
-                fix="train the model with `lagbench train`",
+                f"coefficients of {self.method} out of range: {values.tolist()}, "
+                f"expected are -{self.largest:g} to {self.largest:g}",
+                where="weights",
             )
         return np.asarray(values)

@@ -130,7 +130,6 @@ class EncodeProcessDecode(LayeredNetwork):
         The prediction has the shape [particle, output]. Losses are means over the
         layers.
         """
-        input_dtype = node.dtype
         node = self.node_encoder(node)
         edge = self.edge_encoder(edge)
         layer_losses: list[Losses] = []
@@ -144,29 +143,7 @@ class EncodeProcessDecode(LayeredNetwork):
             of_layers = torch.stack(values)
             mean_losses[name] = of_layers.mean()
 
-        # Every frame adds the output to velocities: the three digits of bfloat16 are
-        # too few for that.
-        with torch.autocast(node.device.type, enabled=False):
-            node = node.to(input_dtype)
-            prediction = self.decoder(node)
-        return prediction, mean_losses
-
-
-class LayerNorm(nn.LayerNorm):
-    """A LayerNorm whose weights learn in bfloat16 too.
-
-    On CPUs, torch sums their gradients over the rows in bfloat16: 5,000 ones sum to
-    512. Here they are those of a product and a sum, which torch adds up in float32.
-    """
-
-    def forward(self, input: Tensor) -> Tensor:
-        """Return rows of mean 0 and deviation 1, times weight, plus bias."""
-        if input.device.type != "cpu" or input.dtype != torch.bfloat16:
-            return super().forward(input)
-        normal = nn.functional.layer_norm(input, self.normalized_shape, eps=self.eps)
-        weight = self.weight.to(input.dtype)
-        bias = self.bias.to(input.dtype)
-        return torch.addcmul(bias, normal, weight)
+        return self.decoder(node), mean_losses
 
 
 def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:
@@ -177,7 +154,7 @@ def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:
         layers.append(nn.ReLU(inplace=True))
     layers.pop()  # no ReLU after the last
     if norm:
-        layers.append(LayerNorm(widths[-1]))
+        layers.append(nn.LayerNorm(widths[-1]))
     return nn.Sequential(*layers)
 
 

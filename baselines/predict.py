@@ -8,7 +8,6 @@ machine does not count, and it compares with that of a solver on one core.
 
 from __future__ import annotations
 
-import functools
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,7 +38,6 @@ from .machine import (
     read_load,
     use_threads,
 )
-from .provenance import training_provenance
 from .recipe import change_options
 from .rollout import (
     Rollout,
@@ -392,11 +390,7 @@ def restore_for_size(
     entry = find(checkpoint.baseline)
     options = change_options(entry, checkpoint.options, settings)
     size = registry.size(info.split, info.size)
-    check_symmetry(
-        options.get("symmetry"),
-        size,
-        find_forcing=functools.partial(find_forcing, size, root),
-    )
+    check_symmetry(options.get("symmetry"), size, find_forcing(size, root))
     try:
         return restore(replace(scaled, options=options), where=where)
     except UnreadableFileError as error:
@@ -416,15 +410,13 @@ def _training_attributes(
     The validations of a training at another size are left out: no validation of this
     size could be compared with them.
     """
-    provenance = training_provenance(checkpoint).model_copy(
+    provenance = checkpoint.provenance().model_copy(
         update={"prediction_overrides": tuple(settings)}
     )
-    recipe = checkpoint.training.get("recipe", {})
-    seed = recipe.get("training", {}).get("seed", 0)
     attributes: dict[str, Any] = {
         "training": provenance.describe(),
         "provenance": provenance.to_json(),
-        "seed": int(seed),
+        "seed": checkpoint.seed,
     }
 
     budget = checkpoint.budget

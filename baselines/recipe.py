@@ -121,8 +121,6 @@ class TrainingOptions(Settings):
     ema: float = Field(default=0.0, ge=0.0, lt=1.0)
     # largest norm of the gradient; None clips nothing
     clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    # 'bf16' runs matrix products in bfloat16; weights stay float32
-    precision: Literal["float32", "bf16"] = "float32"
     # fuse the operations of a graph network's processor layers by torch.compile; needs
     # a C++ compiler on CPUs
     compile: bool = False

@@ -21,7 +21,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import Field
@@ -460,23 +460,6 @@ class GraphNetwork(Baseline):
         for is_contradiction, words in contradictions:
             if is_contradiction:
                 raise UsageError(f"model.{words}", where=self.method)
-
-    def adapt_weights(
-        self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
-    ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Return the weights, with a fall if and only if this model has one.
-
-        A fall that the weights have not is 0.
-        """
-        name = "free_flight.fall"
-        if self.free_flight is None:
-            others = dict(weights)
-            others.pop(name, None)
-            return others, options
-        if name in weights:
-            return weights, options
-        no_fall = torch.zeros_like(self.free_flight.fall)
-        return {**weights, name: no_fall}, options
 
     @property
     def forcing_seen(self) -> frozenset[str]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import UsageError
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import Budget
 
 from .baseline import Baseline, DatasetInfo, rescale
@@ -31,7 +31,6 @@ WHERE = "--start"
 class TrainingStart:
     """Weights that a training starts from."""
 
-    path: Path  # their file
     # public figures of the data at hand, in the units of the weights
     info: DatasetInfo
     weights: Mapping[str, Tensor]
@@ -46,22 +45,21 @@ class TrainingStart:
         Raises:
             UsageError: they are of another network, or mean something else there.
         """
-        model_options = model.options.model_dump(mode="json")
-        adapted, options = model.adapt_weights(self.weights, self.options)
+        asked = model.options.model_dump(mode="json")
         changed = []
-        for name, value in options.items():
-            if model_options[name] != value:
+        for name in sorted(model.options.of_weights):
+            if asked[name] != self.options[name]:
                 changed.append(name)
-
-        shapes = {name: value.shape for name, value in adapted.items()}
-        expected = {name: value.shape for name, value in model.state_dict().items()}
-        if shapes != expected or model.options.of_weights.intersection(changed):
+        try:
+            load_weights(model, self.weights, where=WHERE)
+        except UnreadableFileError as error:
+            changed.append(error.text)
+        if changed:
             raise UsageError(
-                f"the weights are of a model with another {', '.join(changed)}; leave "
-                "out the --set of these options",
+                f"the weights are of another model: {', '.join(changed)}; leave out "
+                "the --set of its options",
                 where=WHERE,
             )
-        load_weights(model, adapted, where=str(self.path))
 
 
 def start_from(
@@ -102,17 +100,14 @@ def start_from(
     )
     info = rescale(checkpoint.info, target)
     model = restore(replace(checkpoint, info=info), where=str(file))
-    options = model.options.model_dump(
-        mode="json", exclude=set(model.options.in_training)
-    )
-
     budget = checkpoint.budget or Budget()
     steps = budget.steps or int(checkpoint.training.get("step", 0))
     return TrainingStart(
-        path=file,
         info=info,
         weights=checkpoint.weights,
-        options=options,
+        options=model.options.model_dump(
+            mode="json", exclude=set(model.options.in_training)
+        ),
         record={
             "recipe": checkpoint.recipe.get("name", "unnamed"),
             "sha256": file_sha256(file),
@@ -124,10 +119,3 @@ def start_from(
             },
         },
     )
-
-
-def describe_start(start: Mapping[str, Any] | None) -> str:
-    """Return recipe and hash of the weights of a start; nothing for random ones."""
-    if start:
-        return f"{start['recipe']}, weights {start['sha256'][:12]}"
-    return ""

@@ -63,12 +63,10 @@ class RestShape:
         identity = torch.eye(2, device=position.device)
         slack = SLACK * grid.spacing**2 * identity
 
-        # The three digits of bfloat16 are too few for a strain.
-        with torch.autocast(position.device.type, enabled=False):
-            mean_offset = _relative_means(grid, stencil, weight_sum, position)
-            spread = torch.einsum("pnd,pne->pde", mean_offset, weighted_offset)
-            inverse_spread = torch.linalg.inv(spread + slack)
-            lever = weighted_offset @ inverse_spread
+        mean_offset = _relative_means(grid, stencil, weight_sum, position)
+        spread = torch.einsum("pnd,pne->pde", mean_offset, weighted_offset)
+        inverse_spread = torch.linalg.inv(spread + slack)
+        lever = weighted_offset @ inverse_spread
         if is_solid is not None:
             lever = lever * is_solid[:, None, None]
         return cls(grid, position, stencil, weight_sum, lever)
@@ -86,9 +84,8 @@ class RestShape:
         mean_offset = _relative_means(
             self.grid, self.stencil, self.weight_sum, displacement
         )
-        with torch.autocast(position.device.type, enabled=False):
-            gradient = torch.einsum("pnd,pne->pde", mean_offset, self.lever)  # F - 1
-            strain = 0.5 * (gradient + gradient.mT + gradient @ gradient.mT)
+        gradient = torch.einsum("pnd,pne->pde", mean_offset, self.lever)  # F - 1
+        strain = 0.5 * (gradient + gradient.mT + gradient @ gradient.mT)
         components = strain.flatten(1)[:, [0, 1, 3]]
         scaled = components / UNIT
         return scaled.tanh()

@@ -13,7 +13,6 @@ average their gradients (DDP).
 from __future__ import annotations
 
 import csv
-import functools
 import json
 import math
 import os
@@ -22,7 +21,7 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from itertools import chain, count, islice, pairwise
@@ -32,7 +31,6 @@ from types import FrameType
 import numpy as np
 import torch
 import torch.distributed
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader, Sampler
@@ -58,7 +56,7 @@ from .optimisation import Optimisation
 from .randomness import derive_seed, preserve_generators, seed_generators
 from .recipe import Recipe, TrainingOptions, recipe_for
 from .rollout import Validation, load_validation, scenario_batch, scenario_paths
-from .start import describe_start, start_from
+from .start import start_from
 from .training_log import OVER, STOPPED_EARLY, TrainingLog
 
 WEIGHTS = "weights.safetensors"  # the best weights in bfloat16, to predict from
@@ -68,9 +66,6 @@ LOSSES = "losses.csv"  # loss terms and learning rate of some steps
 LOG_FORMAT = 1  # of training.json
 # libraries whose versions decide the result
 LIBRARIES = ("lagbench", "torch", "torch-geometric", "numpy", "scipy")
-FIT_STEPS = 1  # a closed form counts as one step
-READING = "reading"  # the stage in which a fit reads scenarios
-FITTING = "fitting"  # the stage in which it evaluates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +83,7 @@ class TrainingResult:
     start: str  # weights of its start; empty for random ones
     first_step: int  # optimiser steps that were there when this call began
     step: int  # optimiser steps made
-    steps: int  # steps of the whole training
+    steps: int  # steps of the whole training; a fit counts as one
     parameters: int  # trainable parameters
     # raw loss terms of the last step, and their weighted sum 'total'
     loss: dict[str, float]
@@ -181,8 +176,8 @@ def train(
         seed=seed,
         learned=None if initial is None else initial.options,
     )
-    forcing = functools.partial(find_forcing, tier, root_folder)
-    check_symmetry(plan.model.get("symmetry"), tier, find_forcing=forcing)
+    forcing = find_forcing(tier, root_folder)
+    check_symmetry(plan.model.get("symmetry"), tier, forcing)
     if initial is not None:
         info = initial.info
         plan = replace(plan, start=initial.record)
@@ -216,17 +211,17 @@ def train(
         elif initial is not None:
             initial.load_into(model)
         if not is_helper() and model.forcing_seen is not None:
-            unseen = sorted(forcing() - model.forcing_seen)
+            unseen = sorted(forcing - model.forcing_seen)
             if unseen:
                 message = (
                     f"{model.method} does not see the {' and '.join(unseen)} of "
-                    f"{tier.split}: it can only learn the mean effect; graph networks, "
-                    f"MLP and LSTM see it with --set model.{unseen[0]}=true"
+                    f"{tier.split}: it can only learn the mean effect; graph networks "
+                    f"see it with --set model.{unseen[0]}=true"
                 )
                 warnings.warn(message, UnseenForcingWarning, stacklevel=2)
         training = _Training(
-            plan,
-            info,
+            plan=plan,
+            info=info,
             folder=folder,
             model=model,
             earlier=earlier,
@@ -278,11 +273,10 @@ def _count_processes() -> int:
 @contextmanager
 def _connected_processes(device: str) -> Iterator[torch.device]:
     """Yield the device of this process; connect the processes of torchrun."""
+    machine = torch.device("cpu")
     if device == "cuda":
         machine = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(machine)
-    else:
-        machine = torch.device("cpu")
     if _count_processes() == 1:
         yield machine
         return
@@ -291,6 +285,28 @@ def _connected_processes(device: str) -> Iterator[torch.device]:
         yield machine
     finally:
         torch.distributed.destroy_process_group()
+
+
+@contextmanager
+def _noting_interrupts() -> Iterator[threading.Event]:
+    """Note the first interrupt of a user, and let a second one through."""
+    interrupt = threading.Event()
+
+    def note(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if interrupt.is_set():
+            raise KeyboardInterrupt
+        interrupt.set()
+
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handlers[number] = signal.signal(number, note)
+    try:
+        yield interrupt
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 class StepBatches(Sampler[list[int]]):
@@ -324,87 +340,46 @@ class StepBatches(Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         """Yield the windows of each step."""
-        windows_before = self.steps.start * self.batch
-        epoch, used = divmod(windows_before, len(self.sampler))
-        self.sampler.seek(epoch, used * self.sampler.ranks)
-        endless = chain.from_iterable(self.sampler for _ in count())
-        for step in self.steps:
-            drawn = list(islice(endless, self.batch))
-            windows = self._replace_some(np.array(drawn), step)
-            yield windows.tolist()
-
-    def _replace_some(self, windows: NDArray[np.intp], step: int) -> NDArray[np.intp]:
-        """Return the windows of a step, some of them replaced."""
         sampler = self.sampler
-        place_in_training = [sampler.seed, step, sampler.rank, sampler.ranks]
-        seed = np.random.SeedSequence(place_in_training)
-        generator = np.random.Generator(np.random.PCG64(seed))
-        # NumPy promises the same bits for `random` alone.
-        chance, share = generator.random((2, self.batch))
-        place = share * len(self.openings)
-        index = place.astype(np.intp)
-        opening = self.openings[index]
-        is_replaced = chance < self.opening_share
-        return np.where(is_replaced, opening, windows)
+        windows_before = self.steps.start * self.batch
+        epoch, used = divmod(windows_before, len(sampler))
+        sampler.seek(epoch, used * sampler.ranks)
+        endless = chain.from_iterable(sampler for _ in count())
+        for step in self.steps:
+            windows = np.array(list(islice(endless, self.batch)))
+            place_in_training = [sampler.seed, step, sampler.rank, sampler.ranks]
+            seed = np.random.SeedSequence(place_in_training)
+            generator = np.random.Generator(np.random.PCG64(seed))
+            # NumPy promises the same bits for `random` alone.
+            chance, share = generator.random((2, self.batch))
+            opening = self.openings[(share * len(self.openings)).astype(np.intp)]
+            yield np.where(chance < self.opening_share, opening, windows).tolist()
 
 
-class _Interrupts:
-    """Notes the first interrupt of a user, and lets a second one through."""
-
-    def __init__(self) -> None:
-        self.is_set = False
-
-    @contextmanager
-    def listen(self) -> Iterator[None]:
-        """Listen for a while; signals are the main thread's alone."""
-        handlers = {}
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                handlers[number] = signal.signal(number, self._note)
-        try:
-            yield
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.is_set:
-            raise KeyboardInterrupt
-        self.is_set = True
-
-
+@dataclass(kw_only=True)
 class _Training:
     """A training in one process, beside others perhaps."""
 
-    def __init__(
-        self,
-        plan: Recipe,
-        info: DatasetInfo,
-        *,
-        folder: Path,
-        model: Baseline,
-        earlier: Checkpoint | None,
-        root: Path,
-        registry: Registry,
-        device: torch.device,
-        meter: Meter,
-    ) -> None:
-        self.plan = plan
-        self.options = plan.training
-        self.info = info
-        self.folder = folder
-        self.model = model
-        self.earlier = earlier  # state to go on from; None at the start
-        self.root = root
-        self.registry = registry
-        self.device = device
-        self.meter = meter
+    plan: Recipe
+    info: DatasetInfo
+    folder: Path
+    model: Baseline
+    earlier: Checkpoint | None  # state to go on from; None at the start
+    root: Path
+    registry: Registry
+    device: torch.device
+    meter: Meter
+    windows: int = 0  # of the training subsets
+    steps: int = 1  # of the whole training; a fit counts as one
+    optimisation: Optimisation | None = None  # None in a fit
+
+    def __post_init__(self) -> None:
+        """Begin the log, or go on with that of the earlier run."""
         self.processes = _count_processes()
         self.log = TrainingLog()
-        if earlier is not None:
-            self.log = TrainingLog.continue_from(earlier.training)
+        if self.earlier is not None:
+            self.log = TrainingLog.continue_from(self.earlier.training)
         self.first_step = self.log.step
-        self.windows = 0  # of the training subsets
 
     def descend(self) -> TrainingResult:
         """Train the model by steps.
@@ -413,7 +388,7 @@ class _Training:
             KeyboardInterrupt: a user interrupted it; the state is stored.
         """
         log = self.log
-        options = self.options
+        options = self.plan.training
         model = self.model.to(self.device)
         data = WindowDataset(
             self.info.split,
@@ -427,12 +402,11 @@ class _Training:
             verify=True,
         )
         self.windows = len(data)
-        steps = options.total_steps(len(data), processes=self.processes)
-        if log.state == STOPPED_EARLY:
-            return self._result(steps)
-        if log.step >= steps:
+        self.steps = options.total_steps(len(data), processes=self.processes)
+        if log.step >= self.steps:
             log.state = "finished"
-            return self._result(steps)
+        if log.state in OVER:
+            return self._result()
 
         log.state = "running"
         if options.compile:
@@ -440,16 +414,17 @@ class _Training:
         optimisation = Optimisation(
             model,
             options,
-            steps=steps,
+            steps=self.steps,
             processes=self.processes,
             step=log.step,
             state=None if self.earlier is None else self.earlier.optimizer,
         )
+        self.optimisation = optimisation
         rank = int(os.environ.get("RANK", "0"))
         sampler = WindowSampler(
             data, seed=options.seed, rank=rank, ranks=self.processes
         )
-        batches = StepBatches(sampler, options, first=log.step, last=steps)
+        batches = StepBatches(sampler, options, first=log.step, last=self.steps)
         loader = DataLoader(data, batch_sampler=batches, collate_fn=collate)
         validation = load_validation(
             options, self.info, root=self.root, registry=self.registry
@@ -457,99 +432,150 @@ class _Training:
         validations = 0
         if validation is not None:
             validations = options.count_validations(
-                steps,
+                self.steps,
                 trained=options.batch * model.future,
                 rolled=sum(validation.frames.values()),
             )
+
         forward: torch.nn.Module = model
         if self.processes > 1:
             forward = DistributedDataParallel(model)
-
-        interrupts = _Interrupts()
         model.train()
-        self.meter.begin("training", total=steps, scenarios=steps, done=log.step)
-        with interrupts.listen():
+        self.meter.begin(
+            "training", total=self.steps, scenarios=self.steps, done=log.step
+        )
+        with _noting_interrupts() as interrupt:
             if validation is not None and self.plan.start and not log.validation:
-                self._validate(validation, optimisation)
-                self._store(optimisation)
+                self._validate(validation)
+                self._store()
             for batch in loader:
                 seed = derive_seed(options.seed, log.step, rank)
                 seed_generators(seed)
                 generator = torch.Generator(device=self.device).manual_seed(seed)
-                # A cache of rounded weights would sum the gradients of their uses in
-                # bfloat16.
-                with torch.autocast(
-                    self.device.type,
-                    dtype=torch.bfloat16,
-                    enabled=options.precision == "bf16",
-                    cache_enabled=False,
-                ):
-                    terms = forward(batch.to(self.device), generator)
-                    loss = optimisation.weigh(terms)
+                terms = forward(batch.to(self.device), generator)
                 try:
-                    optimisation.make_step(loss)
+                    optimisation.make_step(optimisation.weigh(terms))
                 except Exception:
                     log.state = "failed"
-                    self._write_log(steps)
+                    self._write_log()
                     raise
-                self._log_step(optimisation)
+
+                log.step = optimisation.step
+                log.windows_seen = log.step * options.batch * self.processes
+                log.epochs = log.windows_seen / self.windows
+                is_last = log.step >= self.steps
+                if is_last or log.step == 1 or log.step % options.log_every == 0:
+                    self._log_loss(optimisation)
+                self.meter.count(1, scenarios=1)
 
                 if validation is not None and options.is_validated(
-                    log.step, steps=steps, validations=validations
+                    log.step, steps=self.steps, validations=validations
                 ):
-                    self._validate(validation, optimisation)
-                if log.step >= steps:
+                    self._validate(validation)
+                patience = options.patience
+                if is_last:
                     log.state = "finished"
-                elif self._is_patience_over():
+                elif patience is not None and log.validations_since_best() >= patience:
                     log.state = STOPPED_EARLY
-                elif self._sum_over_processes(float(interrupts.is_set)) > 0:
+                elif self._sum_over_processes(float(interrupt.is_set())) > 0:
                     log.state = "interrupted"
-                every = options.checkpoint_every or max(1, steps // 20)
+                every = options.checkpoint_every or max(1, self.steps // 20)
                 if log.state != "running" or log.step % every == 0:
-                    self._store(optimisation)
+                    self._store()
                 if log.state == "interrupted":
                     raise KeyboardInterrupt
                 if log.state in OVER:
                     break
-        return self._result(steps)
+        return self._result()
 
-    def _log_step(self, optimisation: Optimisation) -> None:
-        """Count a step, and log its loss where that is due."""
+    def fit(self) -> TrainingResult:
+        """Fit the model to scenarios of train; a finished fit is not repeated.
+
+        :class:`Baseline` describes what the method ``fit`` of the model gets and
+        returns.
+        """
         log = self.log
-        options = self.options
-        log.step = optimisation.step
-        log.windows_seen = log.step * options.batch * self.processes
-        log.epochs = log.windows_seen / self.windows
-        is_last = log.step >= optimisation.steps
-        if is_last or log.step == 1 or log.step % options.log_every == 0:
-            terms = {}
-            for name, value in optimisation.terms.items():
-                terms[name] = float(value)
-            log.loss = terms
-            self.meter.stage = f"loss {terms['total']:.3g}"
-            if not is_helper():
-                row = {"step": log.step, "learning_rate": optimisation.learning_rate}
-                _append_row(self.folder / LOSSES, {**row, **terms})
-        self.meter.count(1, scenarios=1)
+        if self.earlier is not None:
+            log.state = "finished"
+            return self._result()
+        size = self.registry.size(self.info.split, self.info.size)
+        paths: list[Path] = []
+        for subset in self.plan.training.windows:
+            files = scenario_paths(
+                self.info.split,
+                subset=subset,
+                size=self.info.size,
+                root=self.root,
+                registry=self.registry,
+            )
+            check_contents(size, self.root, files)
+            paths += files.values()
 
-    def _validate(self, validation: Validation, optimisation: Optimisation) -> None:
+        def read() -> Iterator[Batch]:
+            for path in paths:
+                yield scenario_batch(path, viscosity=size.viscosity())
+                self.meter.count(1, scenarios=1)
+
+        self.meter.begin(
+            "reading", total=len(paths), scenarios=len(paths), unit="scenarios"
+        )
+        numbers = self.model.fit(read())  # type: ignore[operator]
+        for name, value in numbers.items():
+            log.loss[name] = float(value)
+        log.step = self.steps
+        log.epochs = 1.0
+        validation = load_validation(
+            self.plan.training, self.info, root=self.root, registry=self.registry
+        )
+        if validation is not None:
+            self._validate(validation)
+        log.state = "finished"
+        self._store()
+        return self._result()
+
+    def _log_loss(self, optimisation: Optimisation) -> None:
+        """Log the loss of a step; append it to the CSV file.
+
+        After a crash the file may have rows of steps that are made again.
+        """
+        terms = {name: float(value) for name, value in optimisation.terms.items()}
+        self.log.loss = terms
+        self.meter.stage = f"loss {terms['total']:.3g}"
+        if is_helper():
+            return
+        row = {
+            "step": optimisation.step,
+            "learning_rate": optimisation.learning_rate,
+            **terms,
+        }
+        path = self.folder / LOSSES
+        is_new = not path.exists()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", newline="") as stream:
+            writer = csv.DictWriter(stream, [*row])
+            if is_new:
+                writer.writeheader()
+            writer.writerow(row)
+
+    def _validate(self, validation: Validation) -> None:
         """Validate in the first process; all processes act on the value."""
         self._read_clocks()
         before = self.log.cpu_seconds
         value = 0.0
         if not is_helper():
-            with optimisation.use_mean():
+            with self._mean_weights():
                 value = validation.measure(self.model)
         value = self._sum_over_processes(value)
         self._read_clocks()
         self.log.validation_cpu_seconds += self.log.cpu_seconds - before
-        is_best = self.log.add_validation(validation.metric, value)
-        if is_best:
-            self._publish(optimisation)
+        if self.log.add_validation(validation.metric, value):
+            self._publish()
 
-    def _is_patience_over(self) -> bool:
-        patience = self.options.patience
-        return patience is not None and self.log.validations_since_best() >= patience
+    def _mean_weights(self) -> AbstractContextManager[None]:
+        """Replace the weights by their running means for a while, if there are any."""
+        if self.optimisation is None:
+            return nullcontext()
+        return self.optimisation.use_mean()
 
     def _sum_over_processes(self, value: float) -> float:
         if self.processes == 1:
@@ -558,15 +584,15 @@ class _Training:
         torch.distributed.all_reduce(total)
         return float(total)
 
-    def _publish(self, optimisation: Optimisation) -> None:
+    def _publish(self) -> None:
         """Write the weights to predict from."""
         if is_helper():
             return
-        with optimisation.use_mean():
+        with self._mean_weights():
             weights = round_weights(self.model)
             save(self.folder / WEIGHTS, self._checkpoint(weights))
 
-    def _store(self, optimisation: Optimisation) -> None:
+    def _store(self) -> None:
         """Write checkpoint and log; the weights get the budget of the whole training.
 
         Raises:
@@ -575,15 +601,17 @@ class _Training:
         if is_helper():
             return
         weights = self.model.state_dict()
-        for value in weights.values():
-            if not torch.isfinite(value).all():
-                raise optimisation.not_finite()
+        state = None
+        if self.optimisation is not None:
+            for value in weights.values():
+                if not torch.isfinite(value).all():
+                    raise self.optimisation.not_finite()
+            state = self.optimisation.state_tensors()
         self._read_clocks()
-        state = optimisation.state_tensors()
         save(self.folder / CHECKPOINT, self._checkpoint(weights, state))
-        self._write_log(optimisation.steps)
+        self._write_log()
         if self.log.best_step is None:
-            self._publish(optimisation)
+            self._publish()
             return
         best = load(self.folder / WEIGHTS)
         budget = self._budget().model_dump(mode="json")
@@ -612,14 +640,12 @@ class _Training:
             optimizer=state,
         )
 
-    def _write_log(self, steps: int) -> None:
+    def _write_log(self) -> None:
         if is_helper():
             return
         info = self.info
         budget = self._budget()
-        versions = {"python": platform.python_version()}
-        for name in LIBRARIES:
-            versions[name] = version(name)
+        versions = {name: version(name) for name in LIBRARIES}
         content = {
             "format": LOG_FORMAT,
             "baseline": self.plan.baseline,
@@ -632,10 +658,10 @@ class _Training:
             "parameters": count_parameters(self.model),
             "processes": self.processes,
             "hardware": hardware(self.device.type),
-            "versions": versions,
+            "versions": {"python": platform.python_version(), **versions},
             "budget": budget.model_dump(mode="json"),
             "track": track_of(info.size, budget),
-            "steps": steps,
+            "steps": self.steps,
             "windows": self.windows,
             **asdict(self.log),
         }
@@ -684,11 +710,15 @@ class _Training:
             validations=tuple(chosen[::-1]),
         )
 
-    def _result(self, steps: int) -> TrainingResult:
+    def _result(self) -> TrainingResult:
         """Return the result of the training, with the log but for its validations."""
         budget = self._budget()
         log_values = asdict(self.log)
         del log_values["validation"]
+        start = self.plan.start
+        start_words = ""
+        if start:
+            start_words = f"{start['recipe']}, weights {start['sha256'][:12]}"
         return TrainingResult(
             baseline=self.plan.baseline,
             split=self.info.split,
@@ -697,121 +727,13 @@ class _Training:
             folder=self.folder,
             weights=self.folder / WEIGHTS,
             checkpoint=self.folder / CHECKPOINT,
-            steps=steps,
+            steps=self.steps,
             parameters=count_parameters(self.model),
             device=budget.device or "",
             threads=budget.threads or 0,
             track=track_of(self.info.size, budget),
-            start=describe_start(self.plan.start),
+            start=start_words,
             is_fitted=self.model.closed_form,
             first_step=self.first_step,
             **log_values,
         )
-
-    def fit(self) -> TrainingResult:
-        """Fit the model to scenarios of train; a finished fit is not repeated.
-
-        :class:`Baseline` describes what the method ``fit`` of the model gets and
-        returns.
-        """
-        log = self.log
-        model = self.model
-        if self.earlier is not None:
-            log.state = "finished"
-            return self._result(FIT_STEPS)
-        if model.fits_batches:
-            most = getattr(model.options, "scenarios", None)
-            evaluations = int(getattr(model, "evaluations", 0))
-            counter = functools.partial(self._count_evaluations, evaluations)
-            scenarios = self._read_scenarios(most=most)
-            numbers = model.fit(scenarios, count=counter)  # type: ignore[operator]
-        else:
-            positions = (
-                scenario.position.transpose(0, 1).numpy()
-                for scenario in self._read_scenarios()
-            )
-            numbers = model.fit(positions)  # type: ignore[operator]
-        log.step = FIT_STEPS
-        log.epochs = 1.0
-        for name, value in numbers.items():
-            log.loss[name] = float(value)
-
-        validation = load_validation(
-            self.options, self.info, root=self.root, registry=self.registry
-        )
-        if validation is not None:
-            self._read_clocks()
-            before = log.cpu_seconds
-            value = validation.measure(model)
-            self._read_clocks()
-            log.validation_cpu_seconds += log.cpu_seconds - before
-            log.add_validation(validation.metric, value)
-        log.state = "finished"
-        self._read_clocks()
-        save(self.folder / WEIGHTS, self._checkpoint(round_weights(model)))
-        save(self.folder / CHECKPOINT, self._checkpoint(model.state_dict()))
-        self._write_log(FIT_STEPS)
-        return self._result(FIT_STEPS)
-
-    def _count_evaluations(self, evaluations: int, evaluated: int) -> None:
-        """Count what a fit has evaluated. The first count begins a stage of its own.
-
-        A scenario is read in less time than an evaluation takes, so they are not
-        counted together: the rate would be of both.
-
-        Args:
-            evaluations: how many evaluations the fit makes, at most.
-            evaluated: how many were made since the last count.
-        """
-        if self.meter.stage == FITTING:
-            self.meter.count(evaluated, scenarios=evaluated)
-            return
-        self.meter.begin(
-            FITTING,
-            total=evaluations,
-            scenarios=evaluations,
-            done=evaluated,
-            unit="evaluations",
-        )
-
-    def _read_scenarios(self, *, most: int | None = None) -> Iterator[Batch]:
-        """Yield each training scenario as a batch of one window.
-
-        Args:
-            most: scenarios to read, the first ones; all when None.
-        """
-        size = self.registry.size(self.info.split, self.info.size)
-        paths: list[Path] = []
-        for subset in self.options.windows:
-            files = scenario_paths(
-                self.info.split,
-                subset=subset,
-                size=self.info.size,
-                root=self.root,
-                registry=self.registry,
-            )
-            check_contents(size, self.root, files)
-            paths += files.values()
-        paths = paths[:most]
-        count = len(paths)
-        self.meter.begin(READING, total=count, scenarios=count, unit="scenarios")
-        for path in paths:
-            scenario = scenario_batch(path, viscosity=size.viscosity())
-            # A fit may evaluate what it has read before it reads on.
-            if self.meter.stage == READING:
-                self.meter.count(1, scenarios=1)
-            yield scenario
-
-
-def _append_row(path: Path, row: Mapping[str, object]) -> None:
-    """Append a row to a CSV file, after a header where the file is new.
-
-    After a crash the file may have rows of steps that are made again.
-    """
-    is_new = not path.exists()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", newline="") as stream:
-        writer = csv.DictWriter(stream, [*row])
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)

@@ -159,11 +159,7 @@ class UNet(nn.Module):
         both = torch.cat([doubled, fine], dim=1)
         fine = self.up_fine(both)
 
-        # Every frame adds the output to velocities: the three digits of bfloat16 are
-        # too few for that.
-        with torch.autocast(field.device.type, enabled=False):
-            fine = fine.to(field.dtype)
-            output: Tensor = self.end(gelu(fine))
+        output: Tensor = self.end(gelu(fine))
         return output
 
 
@@ -196,4 +192,4 @@ class ContextNetwork(nn.Module):
         by_channel = encoded.flatten(2)
         box_mean = by_channel.mean(dim=2)
         numbers: Tensor = self.numbers(box_mean)
-        return numbers.to(field.dtype)
+        return numbers

@@ -271,11 +271,11 @@ def _with_weights(
             seed = seeds[number]
         else:
             check_installed("torch", extra="baselines")
-            from lagbench.baselines.weights_file import inspect_weights
+            from lagbench.baselines.checkpoint import load as load_weights
 
-            inspected = inspect_weights(path)
-            split = inspected.data_set[0]
-            seed = inspected.seed
+            checkpoint = load_weights(path)
+            split = checkpoint.info.split
+            seed = checkpoint.seed
         if split != header.split or seed not in seeds:
             raise UsageError(
                 f"{path} holds weights of {split}, seed {seed}; the predictions are of "

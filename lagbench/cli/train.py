@@ -60,7 +60,7 @@ def train_command(
 ) -> None:
     """Train a reference model.
 
-    An interrupted call goes on where it stopped. Only a fit (VAR, hybrids) begins anew.
+    An interrupted call goes on where it stopped. Only a fit (VAR) begins anew.
 
     Args:
         split: Name of the split, or folder of a local one.

@@ -123,16 +123,6 @@ def test_bodies_are_the_components_of_all_pairs(
     assert bodies.body.tolist() == label.tolist()
 
 
-def test_weights_lose_their_fall_in_a_model_without_free_flight() -> None:
-    """A training may start from weights with free flight, and go on without it."""
-    flying = network(free_flight=3.4)
-    plain = network()
-    weights = dict(flying.state_dict())
-    adapted, _ = plain.adapt_weights(weights, {})
-    assert adapted.keys() == plain.state_dict().keys()
-    assert "free_flight.fall" in weights
-
-
 def free_flight(gravity: Tensor, *, dimension: int = 2) -> FreeFlight:
     """Return the correction with a given gravity, in a unit box."""
     figures = info(bounds=((0.0, 1.0),) * dimension)

@@ -401,17 +401,3 @@ def test_forgetful_windows_start_from_their_last_frames() -> None:
     model(window)
     all_velocities = velocity_by_frame_count[6]
     assert torch.equal(model.states[1].velocity, all_velocities)
-
-
-def test_half_precision_moves_particles_in_full() -> None:
-    """Under bf16 autocast positions stay float32."""
-    window = batch(swirl(0, 6))
-    model = network(awake=True)
-    exact = rolled(model, window, 1)
-    with torch.autocast("cpu", torch.bfloat16):
-        half = rolled(model, window, 1)
-    assert half.dtype == torch.float32
-    last = window.position[:, -1]
-    displacement = greatest_difference(exact[:, 0], last)
-    difference = greatest_difference(half, exact)
-    assert 0.0 < difference < 0.02 * displacement

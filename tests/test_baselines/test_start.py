@@ -20,7 +20,6 @@ from lagbench.baselines.baseline import DatasetInfo
 from lagbench.baselines.checkpoint import Checkpoint, load, save
 from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.predict import predict
-from lagbench.baselines.provenance import training_provenance
 from lagbench.baselines.train import TrainingResult
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry
@@ -228,7 +227,7 @@ def test_the_record_counts_the_hours_before_the_start(
     sha256 = file_sha256(start)
     assert record["recipe"]["start"]["sha256"] == sha256
     assert sha256[:12] in result.start
-    provenance = training_provenance(load(result.weights))
+    provenance = load(result.weights).provenance()
     words = provenance.describe()
     assert words.endswith(f"curl-noise/mini-made-up, weights {sha256[:12]}")
     again = run("any", *STILL, start=result.weights, to="again")

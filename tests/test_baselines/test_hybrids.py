@@ -1,7 +1,8 @@
-"""The hybrid: without its closure the reference solver, with it a better one."""
+"""The hybrids: what their closures do, and what they are without them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,16 +12,21 @@ from numpy.typing import NDArray
 from simple_models import info
 
 from lagbench.baselines.baseline import Batch, DatasetInfo
-from lagbench.baselines.hybrid_projection import (
-    ClosedGrid,
-    HybridProjection,
-    compute_vorticity,
+from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.baselines.hybrid_coarse import (
+    COEFFICIENTS,
+    HybridCoarse,
+    change_constants,
 )
-from lagbench.baselines.rollout import roll_out
+from lagbench.baselines.hybrid_projection import ClosedGrid, HybridProjection
+from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
 from lagbench.data.box import Box
 from lagbench.data.registry import Size, load
-from lagbench.errors import DataError, UsageError
-from lagbench.references.staggered import StaggeredGrid
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import DataError
+from lagbench.make.generate import GenerationResult
+from lagbench.references import coarse_solver
+from lagbench.references.predictor import given_in
 from lagbench.tensors import TensorWindow, collate
 
 Array = NDArray[np.float64]
@@ -53,8 +59,8 @@ def rounded(values: Array) -> Array:
     return values.astype(np.float32).astype(np.float64)
 
 
-def turning(frames: int, *, decay: float = 0.0) -> Array:
-    """Return particles in one vortex that fades, shape [frame, particle, 2].
+def turning(frames: int) -> Array:
+    """Return particles in one vortex, shape [frame, particle, 2].
 
     The stream function is sin(pi x)^2 sin(pi y)^2 in units of the box.
     """
@@ -63,14 +69,13 @@ def turning(frames: int, *, decay: float = 0.0) -> Array:
     columns, rows = np.meshgrid(axis, axis, indexing="ij")
     place = np.stack([columns, rows], axis=-1).reshape(-1, 2)
     path = [low + SIDE * place]
-    for frame in range(frames - 1):
+    for _ in range(frames - 1):
         sine_x, sine_y = np.sin(np.pi * place).T
         twice_x, twice_y = np.sin(2 * np.pi * place).T
         u = sine_x**2 * twice_y
         v = -twice_x * sine_y**2
         flow = np.stack([u, v], axis=1)
-        speed = 0.004 * np.exp(-decay * frame)
-        place = place + speed * flow
+        place = place + 0.004 * flow
         path.append(low + SIDE * place)
     return np.array(path)
 
@@ -158,78 +163,11 @@ def test_a_particle_in_the_disc_is_put_on_its_surface() -> None:
     path, disc = stream_around_a_disc(channel().task.input_frames)
     model = channel_model()
     state = model.start(window_with_disc(path, disc))
-    (flow,) = state.flows
+    (flow,) = state
     inside = disc[:2] + np.array([0.0, 0.5 * disc[2]])
-    state = replace(state, flows=(replace(flow, position=inside[None]),))
-    _, position = model.advance(state)
+    _, position = model.advance([replace(flow, position=inside[None])])
     distance = np.hypot(*(position.numpy()[0] - disc[:2]))
     assert distance == pytest.approx(disc[2], rel=1e-5)
-
-
-def test_an_obstacle_outside_a_channel_moves_no_particle() -> None:
-    """The model says that it does not see it."""
-    model = HybridProjection.build({}, cavity_info())
-    assert "obstacle" not in model.forcing_seen
-    window = batch_of(turning(6), moving_lid(8), VISCOSITY)
-    low, high = cavity().bounds[0]
-    centre = 0.5 * (low + high)
-    obstacle = torch.tensor([[centre, centre, 0.1]])
-    (expected,) = roll_out(model, window, 2)
-    (rollout,) = roll_out(model, replace(window, obstacle=obstacle), 2)
-    assert torch.equal(rollout.position, expected.position)
-
-
-@pytest.mark.slow
-def test_a_fit_finds_the_radius_of_a_flow_that_it_made_itself() -> None:
-    """The disc that the fluid feels is a third larger than the disc in the file."""
-    true_model = channel_model()
-    true_model.coefficients[3] = 0.33
-    path, disc = stream_around_a_disc(channel().task.input_frames)
-    (rollout,) = roll_out(true_model, window_with_disc(path, disc), 10)
-    predicted = rollout.position.double().numpy()
-    whole_path = np.concatenate([path, predicted])
-
-    model = channel_model(numerical=False, evaluations=30)
-    numbers = model.fit([window_with_disc(whole_path, disc)])
-
-    assert numbers["error"] < 0.1 * numbers["error_without"]
-    assert numbers["radius"] == pytest.approx(0.33, abs=0.03)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("is_periodic", [False, True])
-def test_the_vorticity_of_a_rigid_rotation_is_twice_its_rate(
-    dimension: int, is_periodic: bool
-) -> None:
-    """U = Omega x r. At the seam of a periodic box the rotation jumps: left out."""
-    unit = (0.0, 1.0)
-    cells = 6
-    box = Box.from_bounds((unit,) * dimension, (is_periodic,) * dimension)
-    grid = StaggeredGrid(box, cells=(cells,) * dimension, no_slip=False)
-    rate = np.array([0.3, -0.2, 0.7])
-    if dimension == 2:
-        rate[:2] = 0.0
-    velocity = []
-    for component in range(dimension):
-        faces = np.indices(grid.face_shape(component))
-        place = np.zeros((3, *faces.shape[1:]))
-        for axis in range(dimension):
-            place[axis] = grid.face_origin(component)[axis] + faces[axis] / cells
-        field = np.cross(rate, place, axisb=0, axisc=0)
-        velocity.append(field[component])
-
-    vorticity = compute_vorticity(velocity, grid)
-
-    # Pairs of axes (0, 1), (0, 2), (1, 2): components z, -y, x of the rotation.
-    expected = 2.0 * np.array([rate[2], -rate[1], rate[0]])
-    pair_count = dimension * (dimension - 1) // 2
-    per_pair = vorticity.reshape(pair_count, -1)
-    for value, numbers in zip(expected, per_pair, strict=False):
-        if is_periodic:
-            numbers = numbers.reshape((cells,) * dimension)[
-                (slice(1, None),) * dimension
-            ]
-        np.testing.assert_allclose(numbers, value, atol=1e-12)
 
 
 def test_a_wave_decays_by_viscosity_and_hyperviscosity() -> None:
@@ -291,50 +229,12 @@ def test_the_shortest_wave_decays_where_both_dampings_are_strong() -> None:
     assert np.abs(velocity[0]).max() < 1e-8
 
 
-def test_a_fit_finds_a_damping_that_the_data_show() -> None:
-    """A vortex that fades faster than its viscosity says gets a greater one."""
-    options = {
-        "resolution": 1.0,
-        "frames": 10,
-        "evaluations": 30,
-        "numerical": False,
-    }
-    model = HybridProjection.build(options, cavity_info())
-    path = turning(20, decay=0.06)
-    walls = np.zeros((20, 4, 2))
-    window = batch_of(path, walls, 1e-3)
-    numbers = model.fit([window])
-    assert numbers["relative"] > 0.0
-    assert numbers["error"] < numbers["error_without"]
-
-
-@pytest.mark.slow
-def test_a_fit_finds_the_damping_of_flows_that_it_made_itself() -> None:
-    """The lid's speed changes each frame: a fit that is a frame off has 0.4."""
-    true_model = HybridProjection.build({}, cavity_info())
-    true_model.coefficients.copy_(torch.tensor([0.0, 0.04, 0.06]))
-    given_frames = cavity().task.input_frames
-    fitted_frames = 12
-    walls = moving_lid(given_frames + fitted_frames)
-    walls[:, 3, 0] *= np.cos(2.5 * np.arange(len(walls)))
-    path = turning(given_frames)
-    (rollout,) = roll_out(true_model, batch_of(path, walls, VISCOSITY), fitted_frames)
-    predicted = rollout.position.double().numpy()
-    whole_path = np.concatenate([path, predicted])
-
-    model = HybridProjection.build({"evaluations": 60}, cavity_info())
-    numbers = model.fit([batch_of(whole_path, walls, VISCOSITY)])
-
-    assert numbers["error_without"] > 0.1
-    assert numbers["error"] < 0.02
-
-
 def test_a_flow_that_breaks_down_ends_in_no_number() -> None:
     """Positions are NaN from then on, without an error or a warning."""
     model = HybridProjection.build({}, cavity_info())
     walls = moving_lid(8)
     state = model.start(batch_of(turning(6), walls, VISCOSITY))
-    (flow,) = state.flows
+    (flow,) = state
     flow.field[0][:] = np.inf
     for _ in range(2):
         state, position = model.advance(state)
@@ -348,19 +248,38 @@ def test_damping_out_of_range_is_refused(coefficient: float) -> None:
     model.coefficients[2] = coefficient
     with pytest.raises(DataError) as raised:
         model.start(batch_of(turning(6), moving_lid(6), VISCOSITY))
-    assert raised.value.where == "coefficients of the weights"
+    assert raised.value.where == "weights"
 
 
-def test_scenarios_without_frames_to_fit_are_refused() -> None:
-    model = HybridProjection.build({}, cavity_info())
-    given_frames = cavity().task.input_frames
-    too_short = batch_of(turning(given_frames), moving_lid(given_frames), VISCOSITY)
-    with pytest.raises(UsageError):
-        model.fit([too_short])
+@pytest.mark.slow
+def test_without_changes_it_is_the_coarse_solver(
+    tiny_split: Callable[..., GenerationResult],
+) -> None:
+    """Positions are equal to the bit, in two scenarios side by side too."""
+    size = load().size("multimaterial", "tiny")
+    root = tiny_split("multimaterial").root
+    paths = list(scenario_paths("multimaterial", size="tiny", root=root).values())
+    expected = []
+    for path in paths[:2]:
+        with read_scenario(path) as file:
+            scenario = given_in(file, size, root)
+        positions = coarse_solver.predict(scenario, 2)
+        expected.append(np.array(list(positions)))
+
+    figures = read_dataset_info("multimaterial", "tiny", root=root)
+    model = HybridCoarse.build({}, figures)
+    given = scenario_batch(paths[:2], slice(size.task.input_frames))
+    rollouts = roll_out(model, given, size.task.horizon)
+    for rollout, positions in zip(rollouts, expected, strict=True):
+        np.testing.assert_array_equal(rollout.position.numpy(), positions)
 
 
-def test_a_viscosity_that_is_not_known_is_refused() -> None:
-    model = HybridProjection.build({}, cavity_info())
-    window = batch_of(turning(6), moving_lid(6), None)
-    with pytest.raises(DataError):
-        model.start(window)
+def test_shares_of_a_time_step_stay_at_most_1() -> None:
+    coarse = coarse_solver.coarser(load().size("multimaterial", "tiny"), 2)
+    assert coarse is not None
+    constants = dict.fromkeys(COEFFICIENTS, 0.0)
+    constants |= {"relaxation": 3.0, "coupling": np.log(2.0)}
+    changed = change_constants(coarse, constants)
+    coupling = float(coarse.value("density_coupling"))
+    assert changed.value("jacobian_relaxation") == 1.0
+    assert changed.value("density_coupling") == pytest.approx(2.0 * coupling)
