@@ -130,7 +130,7 @@ class ClosedGrid(StaggeredGrid):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flow:
+class ProjectedFlow:
     """One scenario on the way: its solver and where its fluid is."""
 
     grid: ClosedGrid
@@ -202,7 +202,7 @@ class HybridProjection(Hybrid):
         count = CLOSURE + (self.channel is not None)
         self.register_buffer("coefficients", torch.zeros(count))  # a, b, c, d
 
-    def start(self, given: Batch) -> list[Flow]:
+    def start(self, given: Batch) -> list[ProjectedFlow]:
         """Return the flows that the last two given frames show.
 
         Raises:
@@ -210,7 +210,7 @@ class HybridProjection(Hybrid):
         """
         return [self._begin(given, window) for window in range(given.windows)]
 
-    def _begin(self, given: Batch, window: int) -> Flow:
+    def _begin(self, given: Batch, window: int) -> ProjectedFlow:
         """Return the flow of one window, brought to its last given frame."""
         interval = self.info.frame_interval
         box = self.info.box
@@ -261,7 +261,7 @@ class HybridProjection(Hybrid):
             middle = box.inside(position - step / 2.0)
         else:
             middle = (position + before) / 2
-        flow = Flow(
+        flow = ProjectedFlow(
             grid=grid,
             viscosity=max(viscosity, 0.0),
             walls=walls,
@@ -279,7 +279,7 @@ class HybridProjection(Hybrid):
         field = flow.later_field(frame=last_frame, duration=0.5 * interval)
         return replace(flow, field=field)
 
-    def advance(self, state: list[Flow]) -> tuple[list[Flow], Tensor]:
+    def advance(self, state: list[ProjectedFlow]) -> tuple[list[ProjectedFlow], Tensor]:
         """Return the next state and positions [length], shape [particle, axis]."""
         interval = self.info.frame_interval
         flows = []

@@ -303,14 +303,3 @@ def test_images_of_a_window_have_images_of_the_features(
     assert_close(features(mirrored), expected, rtol=0.0, atol=1e-5)
 
 
-# Deviation of the output over the particles, by the code that knew neither option.
-
-
-def filled(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return weights of the same names and shapes, filled by a formula."""
-    values = {}
-    for name, value in weights.items():
-        count = torch.arange(1.0, value.numel() + 1.0, dtype=torch.float64)
-        numbers = 0.5 * torch.cos(1.7 * count)
-        values[name] = numbers.reshape(value.shape).float()
-    return values
