@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from .baseline import DatasetInfo
 from .deviations import root_mean_square
 from .graph import EMBEDDING, Standardisation, edge_features, wall_distance
-from .network import LayerNorm
 from .operators.gns import GNS
 from .operators.operator import Losses, Operator, sum_edges
 from .simulator import GraphNetwork, GraphNetworkOptions, ParticleState
@@ -128,7 +127,7 @@ class Norm(nn.Module):
 
     def __init__(self, latent: int) -> None:
         super().__init__()
-        self.scalar = LayerNorm(latent)
+        self.scalar = nn.LayerNorm(latent)
 
     def forward(self, scalar: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
         """Return scalars [row, latent] and vectors [row, latent, axis]."""

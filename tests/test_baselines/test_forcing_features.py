@@ -301,5 +301,3 @@ def test_images_of_a_window_have_images_of_the_features(
 
     expected = features(window) * torch.cat([signs, torch.ones(1), signs])
     assert_close(features(mirrored), expected, rtol=0.0, atol=1e-5)
-
-
