@@ -12,8 +12,9 @@ lagbench/design/known.json; better parameters in leaderboard/design take their p
 and writes what it had found after 1, 10 and 100 of them, judged, to
 leaderboard/design/METHOD-BUDGET-SEED.json. Both can be interrupted and go on.
 
-METHOD is random, cma (CMA-ES on the simulator) or cma-coarse (CMA-ES on the restarted
-simulator with half as many cells along each axis).
+METHOD is random, cma (CMA-ES on the simulator), cma-coarse (CMA-ES on the restarted
+simulator with half as many cells along each axis), cma-neuralmpm (CMA-ES on a trained
+NeuralMPM) or gradient-neuralmpm (Adam through it); the last two for one family.
 """
 
 from __future__ import annotations
@@ -55,6 +56,14 @@ SIMULATED: dict[str, tuple[Search, float]] = {
     "cma-coarse": (cma_search, 0.5),
 }
 """Search of each method, and the refinement of the simulator that it runs."""
+
+COARSE_RUNS = {"pour": 2.9, "stir": 2.6, "identify": 2.7}
+"""Runs with half as many cells in the time of one run of the judge's simulator, from
+the least times of nine runs of each.
+"""
+
+THROUGH_MODEL = ("cma-neuralmpm", "gradient-neuralmpm")
+"""Searches that run a trained NeuralMPM, whose file ``--weights`` names."""
 
 
 def find_known(runs: int, names: Sequence[str], rows: Path) -> None:
@@ -117,7 +126,13 @@ class Recorder:
 
 
 def search_all(
-    method: str, *, seed: int, names: Sequence[str], budget: int, rows: Path
+    method: str,
+    *,
+    seed: int,
+    names: Sequence[str],
+    budget: int,
+    rows: Path,
+    weights: Path | None,
 ) -> None:
     """Search every task; the entries of all budgets grow task by task."""
     entries = {}
@@ -129,21 +144,25 @@ def search_all(
             entries[path] = DesignEntry(
                 method=method, budget=each, seed=seed, parameters={}
             )
-    ratios: dict[str, float] = {}
+    speeds: dict[str, float] = {}
     for name in names:
         task = load_task(name)
         family = name.partition("-")[0]
         if all(name in entry.parameters for entry in entries.values()):
             continue
-        search, refinement = SIMULATED[method]
-        objective = partial(task.objective, refinement=refinement)
-        if family not in ratios:
-            ratios[family] = time_of(task, objective) / time_of(task, task.objective)
+        search, objective = method_of(method, task, weights)
+        # runs in the time of one run of the judge's simulator
+        if method == "cma-coarse":
+            speeds[family] = COARSE_RUNS[family]
+        elif method in SIMULATED:
+            speeds[family] = 1.0
+        elif family not in speeds:
+            speeds[family] = time_of(task, task.objective) / time_of(task, objective)
         recorder = Recorder(objective)
-        search(task, recorder, runs=int(budget / ratios[family]), seed=seed)
+        search(task, recorder, runs=max(1, round(budget * speeds[family])), seed=seed)
         judged: dict[tuple[float, ...], Verdict] = {}
         for path, entry in entries.items():
-            runs = int((entry.budget or 0) / ratios[family])
+            runs = round((entry.budget or 0) * speeds[family])
             if not 0 < runs <= len(recorder.history) or name in entry.parameters:
                 continue
             _, values = min(recorder.history[:runs])
@@ -158,12 +177,31 @@ def search_all(
             print(path.stem, name, judged[key].error, flush=True)
 
 
+def method_of(
+    method: str, task: DesignTask, weights: Path | None
+) -> tuple[Search, Objective]:
+    """Return the search and the objective of a method."""
+    if method in SIMULATED:
+        search, refinement = SIMULATED[method]
+        return search, partial(task.objective, refinement=refinement)
+    if weights is None:
+        message = f"{method} needs --weights"
+        raise SystemExit(message)
+    # without torch for the others
+    from benchmarks.design_neuralmpm import Surrogate, descend
+
+    surrogate = Surrogate(weights, task)
+    if method == "cma-neuralmpm":
+        return cma_search, surrogate.objective
+    return partial(descend, surrogate=surrogate), surrogate.objective_and_gradient
+
+
 def time_of(task: DesignTask, objective: Objective) -> float:
-    """Return the processor time of a run [s], kernels compiled: the least of three."""
+    """Return the processor time of a run [s], kernels compiled: the least of five."""
     values = task.at(np.full(len(task.parameters), 0.5))
     objective(values)
     times = []
-    for _ in range(3):
+    for _ in range(5):
         started = time.process_time()
         objective(values)
         times.append(time.process_time() - started)
@@ -185,7 +223,8 @@ def main() -> int:
     known = commands.add_parser("known")
     known.add_argument("--runs", type=int, default=300)
     search = commands.add_parser("search")
-    search.add_argument("method", choices=tuple(SIMULATED))
+    search.add_argument("method", choices=(*SIMULATED, *THROUGH_MODEL))
+    search.add_argument("--weights", type=Path)
     search.add_argument("--seed", type=int, default=0)
     search.add_argument("--budget", type=int, choices=BUDGETS, default=BUDGETS[-1])
     for command in (known, search):
@@ -203,6 +242,7 @@ def main() -> int:
             names=names,
             budget=arguments.budget,
             rows=arguments.rows,
+            weights=arguments.weights,
         )
     return 0
 

@@ -4,6 +4,7 @@ submissions/<split>/<size>/<method>.yaml      entries
 scores/<split>/<size>/<method>[_<seed>].nc    their score files
 floors/<split>/<size>/<name>.nc               scores of the reference predictors
 weights/<split>/<size>/<method>_<seed>.safetensors   weights, or .onnx; a log .json
+design/<name>.json                            judged entries of the design track
 verified.yaml, shift.yaml, gates.json, schema.json, index.html, README.md
 """
 
@@ -23,6 +24,7 @@ Place = tuple[str, str, str]  # split, size and method
 SCORES = "scores"
 REFERENCES = "floors"
 WEIGHTS = "weights"
+DESIGN = "design"
 PAGE = "index.html"
 SCHEMA = "schema.json"
 VERIFIED = "verified.yaml"
@@ -131,6 +133,11 @@ class Folder:
                 paths.append(path.relative_to(self.path))
         return tuple(paths)
 
+    def design_files(self) -> tuple[Path, ...]:
+        """Return the files of the design track, relative to the folder, by name."""
+        paths = sorted((self.path / DESIGN).glob("*.json"))
+        return tuple(path.relative_to(self.path) for path in paths)
+
     def misplaced(self) -> Iterator[Path]:
         """Yield links, and files that are not part of a leaderboard.
 
@@ -147,7 +154,8 @@ class Folder:
                 is_in_place = len(inner.parts) == DEPTH and (
                     inner.suffix in ENDINGS.get(inner.parts[0], ())
                 )
-                if not is_known and not is_in_place:
+                is_design = inner in self.design_files()
+                if not (is_known or is_in_place or is_design):
                     yield inner
 
     @contextmanager

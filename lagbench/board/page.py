@@ -19,11 +19,13 @@ from typing import Any
 from lagbench.addresses import DOCUMENTATION
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry
+from lagbench.design.tasks import FAMILIES
 from lagbench.errors import ChecksFailedError, check_installed
 from lagbench.metrics.table import METRICS
 
 from .collect import collect
 from .columns import SHOWN_METRICS, best_of, columns_of, format_number
+from .design import DesignRow, conclude_design, read_design
 from .entry import schema_bytes
 from .folder import PAGE, SCHEMA, Folder
 from .rows import Board, Row, Tab, conclude
@@ -108,7 +110,9 @@ def build(
     folder = Folder(board)
     content = collect(board, registry=registry, metrics=SHOWN_METRICS)
     files = {
-        folder.path / PAGE: render(content, documentation).encode(),
+        folder.path / PAGE: render(
+            content, documentation, read_design(folder)
+        ).encode(),
         folder.path / SCHEMA: schema_bytes(),
     }
     stale = []
@@ -133,8 +137,10 @@ def build(
     )
 
 
-def render(board: Board, documentation: str = "") -> str:
-    """Return the page of a board."""
+def render(
+    board: Board, documentation: str = "", design: Sequence[DesignRow] = ()
+) -> str:
+    """Return the page of a board, and of the rows of the design track."""
     import jinja2
     import vl_convert
 
@@ -155,6 +161,10 @@ def render(board: Board, documentation: str = "") -> str:
         if curves is not None:
             charts[f"curves-{tab.id}"] = with_config(curves)
         tables.append(_table_of(tab))
+    for family in FAMILIES:
+        design_rows = [row for row in design if row.family == family]
+        if design_rows:
+            charts[f"design-{family}"] = with_config(design_chart(design_rows))
     sizes: dict[str, list[Tab]] = {}
     for tab in sorted(board.tabs, key=lambda tab: tab.size.name == "full"):
         sizes.setdefault(tab.size.name, []).append(tab)
@@ -164,6 +174,9 @@ def render(board: Board, documentation: str = "") -> str:
         sizes=sizes,
         tables=tables,
         conclusion=conclude(board),
+        design_conclusion=conclude_design(design),
+        design=design,
+        families=FAMILIES,
         goal=describe_goal,
         colours=COLOURS,
         metrics=METRICS,
@@ -352,6 +365,45 @@ def curve_chart(tab: Tab) -> Spec | None:
             },
             "tooltip": [{"field": name} for name in ("method", "frame", "error")],
         },
+    }
+
+
+def design_chart(rows: Sequence[DesignRow]) -> Spec:
+    """Return the score that searches reach against their time, with intervals."""
+    points: list[dict[str, Any]] = []
+    for row in rows:
+        low, high = row.interval
+        point = {"method": row.method, "runs": row.budget, "score": row.score}
+        if not math.isnan(low):
+            point |= {"low": low, "high": high}
+        points.append(point)
+    x = {
+        "field": "runs",
+        "type": "quantitative",
+        "title": "time of the search [simulator runs]",
+        "scale": {"type": "log"},
+        "axis": {"values": sorted({row.budget for row in rows})},
+    }
+    colour = {
+        "field": "method",
+        "type": "nominal",
+        "legend": {"orient": "bottom", "columns": 2, "title": None},
+    }
+    y = {"field": "score", "type": "quantitative", "title": "score"}
+    bar = {
+        "x": x,
+        "y": {"field": "low", "type": "quantitative"},
+        "y2": {"field": "high"},
+    }
+    return LARGE | {
+        "data": {"values": points},
+        "layer": [
+            {"mark": "rule", "encoding": bar | {"color": colour}},
+            {
+                "mark": {"type": "line", "point": True},
+                "encoding": {"x": x, "y": y, "color": colour},
+            },
+        ],
     }
 
 

@@ -18,8 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data import WALLS
 from lagbench.data.registry import Size, load
@@ -107,10 +106,12 @@ class DesignTask:
         """The size whose solver runs."""
         return load().size(self.split, "mini")
 
-    def at(self, shares: Floats) -> list[float]:
+    def at(self, shares: ArrayLike) -> list[float]:
         """Return the parameters at shares of the way from low to high, from 0 to 1."""
         values = []
-        for parameter, share in zip(self.parameters, shares.tolist(), strict=True):
+        for parameter, share in zip(
+            self.parameters, np.asarray(shares, np.float64).tolist(), strict=True
+        ):
             values.append(parameter.at(min(max(share, 0.0), 1.0)))
         return values
 
@@ -214,6 +215,9 @@ class DesignTask:
         array = self.check(values)
         if self.observe is None:
             return self.measure(positions, array)
+        # listing the tasks loads no SciPy
+        from scipy.spatial import cKDTree
+
         observed = self.observe()
         displacement = positions[1:] - positions[0]
         start = self.start(self.size, array).position

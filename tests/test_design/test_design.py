@@ -105,7 +105,7 @@ def test_a_killed_judgement_goes_on_to_the_same_hashes(tmp_path: Path) -> None:
     path = tmp_path / "entry.json"
     write_entry(entry, path)
     results = tmp_path / "results.json"
-    words = ["-m", "lagbench", "design", "judge", path, "--results", results]
+    words = ["-m", "lagbench", "design", "judge", str(path), "--results", str(results)]
     process = subprocess.Popen([sys.executable, *words], stdout=subprocess.DEVNULL)
     while not results.exists():
         time.sleep(0.01)
@@ -171,3 +171,13 @@ def test_scores_are_between_the_random_draws_and_the_best_known() -> None:
             assert scale_error(name, known.random) == 0.0
             assert scale_error(name, known.best) == 1.0
             assert scale_error(name, None) == 0.0
+
+
+@pytest.mark.slow
+def test_the_example_hands_in_an_entry(tmp_path: Path) -> None:
+    path = tmp_path / "entry.json"
+    example = Path(__file__).parents[2] / "docs" / "examples" / "design" / "search.py"
+    subprocess.run([sys.executable, example, "--runs", "3", "-o", path], check=True)
+    task = load_task("pour-00")
+    values = read_entry(path).parameters["pour-00"]
+    assert task.error(values) <= task.error(task.at([0.5, 0.5, 0.5, 0.5]))
