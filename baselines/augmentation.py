@@ -36,8 +36,6 @@ from .graph import Bounds
 
 # accelerations in the way back to the true path at most, in their deviations
 _MOST_DEVIATIONS = 3.0
-_WAVES = 3  # that displace the particles of a window
-_LEAST_WAVENUMBER = 1e-6  # far below that of any box [1/length]
 
 
 class Symmetry(enum.StrEnum):
@@ -456,71 +454,6 @@ def draw_noise_levels(most: float, batch: Batch, generator: torch.Generator) -> 
     sample = batch.sample.to(level.device)
     by_particle = level[sample]
     return most * by_particle[:, None, None]
-
-
-def draw_waves(
-    position: Tensor,
-    sample: Tensor,
-    windows: int,
-    generator: torch.Generator,
-    *,
-    strain: float,
-    shortest: float,
-    period: Tensor,
-) -> Tensor:
-    """Return displacements by random waves [length], of the shape of the positions.
-
-    The waves are longitudinal, as sound is: u(x) = sum of (e_i k_i / |k_i|^2)
-    sin(k_i x + phase_i), with a wave vector k_i and a largest strain e_i. Such a wave
-    compresses matter at some places and stretches it at others.
-
-    Each window has three waves. Direction and phase are uniform, the logarithm of the
-    wavelength is uniform over a decade, and the largest strain of a wave is uniform up
-    to the given one. Along a periodic axis a whole number of waves fits the period.
-
-    Args:
-        position: positions [length], shape [particle, axis].
-        sample: window of each particle, shape [particle].
-        windows: number of windows.
-        generator: source of the waves.
-        strain: largest strain of a wave.
-        shortest: shortest wavelength [length]; the longest is ten times as long.
-        period: period of each axis [length], infinite between walls, shape [axis].
-    """
-    device = generator.device
-    shape = (windows, _WAVES)
-    dimension = position.shape[1]
-    turn = 2 * math.pi
-    normal = torch.randn((*shape, dimension), generator=generator, device=device)
-    length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    direction = normal / length
-    phase_share = torch.rand(shape, generator=generator, device=device)
-    phase = turn * phase_share
-    decade = torch.rand(shape, generator=generator, device=device)
-    wavelength = shortest * 10.0**decade
-    strain_share = torch.rand(shape, generator=generator, device=device)
-    wave_strain = strain * strain_share
-
-    free_wavenumber = turn / wavelength[..., None]
-    wave_vector = direction * free_wavenumber
-    periods = period.to(device)
-    phase_of_period = wave_vector * periods
-    waves_in_period = torch.round(phase_of_period / turn)
-    fitting = turn * waves_in_period / periods
-    wave_vector = torch.where(periods.isfinite(), fitting, wave_vector)
-    wavenumber = torch.linalg.vector_norm(wave_vector, dim=-1, keepdim=True)
-    # A wave longer than two periods along every axis fits none: it displaces nothing.
-    wavenumber = wavenumber.clamp(min=_LEAST_WAVENUMBER)
-    amplitude = wave_strain[..., None] * wave_vector / wavenumber**2
-
-    of_particle = sample.to(device)
-    positions = position[:, None].to(device)
-    products = wave_vector[of_particle] * positions
-    angle = products.sum(dim=-1) + phase[of_particle]
-    sine = torch.sin(angle)
-    by_wave = amplitude[of_particle] * sine[..., None]
-    displacement: Tensor = by_wave.sum(dim=1)
-    return displacement.to(position)
 
 
 def augment(

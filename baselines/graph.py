@@ -15,8 +15,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from lagbench.data.box import UNIT_SQUARE, Box
@@ -35,8 +33,6 @@ def radius_graph(
     radius: float,
     sample: Tensor | None = None,
     *,
-    self_edges: bool = False,
-    most: int | None = None,
     box: Box = UNIT_SQUARE,
 ) -> Tensor:
     """Connect all pairs of particles within a radius, itself included.
@@ -45,16 +41,10 @@ def radius_graph(
     sorted by receiver, then sender. Particles of different windows are never connected.
     Particles whose position is no finite number have no edges.
 
-    Where matter has collapsed to a heap, ``most`` bounds memory, and time too unless
-    thousands lie at the very same place. With it not all pairs have both directions;
-    SuperGAT's link loss takes the missing ones as unlinked.
-
     Args:
         position: positions [length], shape [particle, axis].
         radius: connectivity radius [length].
         sample: window of each particle, ascending, shape [particle].
-        self_edges: whether each particle is its own neighbour too.
-        most: neighbours of a receiver at most, the nearest; of equally far ones any.
         box: box that holds the particles; across periodic axes the shortest distance
             counts.
 
@@ -66,105 +56,22 @@ def radius_graph(
             f"positions of shape {tuple(position.shape)} and radius {radius}; expected "
             f"are [particle, {box.dimension}] and a length"
         )
-    x = position.detach().double()
-    if sample is None:
-        window = torch.zeros(len(x), dtype=torch.int64, device=x.device)
-    else:
-        window = sample
+    x = position.detach().double().cpu().numpy()
+    window = np.zeros(len(x), np.int64)
+    if sample is not None:
+        window = sample.cpu().numpy()
 
-    numbers = tree_edges(
-        x.cpu().numpy(),
-        window.cpu().numpy(),
-        radius,
-        box=box,
-        self_edges=self_edges,
-        most=most,
-    )
-    numbers.sort()
-    edges = torch.from_numpy(numbers).to(x.device)
-    senders = edges & 0xFFFFFFFF
-    receivers = edges >> 32
-    return torch.stack([senders, receivers])
-
-
-def _is_neighbour(neighbours: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
-    """Tell which answers of a k-d tree name a particle other than the asking one.
-
-    The answers have shape [particle, rank]; the number of particles stands for none.
-    """
-    receiver = np.arange(count)[:, None]
-    is_particle = neighbours < count
-    is_other = neighbours != receiver
-    return np.asarray(is_particle & is_other)
-
-
-def _nearest_pairs(
-    is_neighbour: NDArray[np.bool_], most: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return receivers and ranks of the first ``most`` neighbours of each particle."""
-    neighbour_count = is_neighbour.cumsum(axis=1)
-    is_heard = is_neighbour & (neighbour_count <= most)
-    receiver, rank = np.nonzero(is_heard)
-    return receiver, rank
-
-
-def tree_edges(
-    x: NDArray[np.float64],
-    window: NDArray[np.int64],
-    radius: float,
-    *,
-    box: Box,
-    self_edges: bool,
-    most: int | None,
-) -> NDArray[np.int64]:
-    """Return receiver * 2^32 + sender of every edge, in any box.
-
-    ``x`` are positions [length], shape [particle, axis], ``window`` the number of the
-    window of each.
-    """
-    parts = [np.empty(0, np.int64)]
+    # receiver * 2^32 + sender of every edge
+    edges = [np.empty(0, np.int64)]
     is_finite = np.isfinite(x).all(axis=1)
-    finite = np.flatnonzero(is_finite)
-    finite_window = window[finite]
-    for number in np.unique(finite_window):
-        is_member = finite_window == number
-        members = finite[is_member]
-        tree = box.tree(x[members])
-        if most is None:
-            pairs = tree.query_pairs(radius, output_type="ndarray")
-            first, second = members[pairs].T
-            forward = (first << 32) | second
-            backward = (second << 32) | first
-            parts += [forward, backward]
-        else:
-            edges = _nearest_in_tree(tree, members, radius, most)
-            parts.append(edges)
-        if self_edges:
-            own_edges = (members << 32) | members
-            parts.append(own_edges)
-    return np.concatenate(parts)
-
-
-def _nearest_in_tree(
-    tree: cKDTree,
-    members: NDArray[np.int64],
-    radius: float,
-    most: int,
-) -> NDArray[np.int64]:
-    """Return the edges to the nearest neighbours of each particle of a tree."""
-    count = len(members)
-    most_ranks = min(most + 1, count)
-    ranks = np.arange(1, most_ranks + 1)
-    points = np.asarray(tree.data)
-    reach = math.nextafter(radius, math.inf)  # the tree leaves out what is as far
-    answer = tree.query(points, k=ranks, distance_upper_bound=reach)
-    neighbours = np.asarray(answer[1])
-    is_neighbour = _is_neighbour(neighbours, count)
-    i, rank = _nearest_pairs(is_neighbour, most)
-    nearest = neighbours[i, rank]
-    receiver = members[i]
-    sender = members[nearest]
-    return np.asarray((receiver << 32) | sender)
+    for number in np.unique(window[is_finite]):
+        members = np.flatnonzero(is_finite & (window == number))
+        pairs = box.tree(x[members]).query_pairs(radius, output_type="ndarray")
+        first, second = members[pairs].T
+        edges += [(first << 32) | second, (second << 32) | first]
+    sorted_edges = np.sort(np.concatenate(edges))
+    numbers = torch.from_numpy(sorted_edges).to(position.device)
+    return torch.stack([numbers & 0xFFFFFFFF, numbers >> 32])
 
 
 MATERIALS = 4  # in datasets.yaml: 0 liquid, 1 jelly, 2 snow, 3 rope

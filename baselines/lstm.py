@@ -12,12 +12,10 @@ import torch
 from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 
-from lagbench.data.grid import Grid, Placement
-
 from .baseline import Batch, DatasetInfo
 from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow
 from .mlp import Activation, dense
-from .torch_grid import transfer
+from .particle_grid import ParticleGrid, score_grid
 
 DropoutRate = Annotated[float, Field(ge=0, lt=1)]
 
@@ -58,6 +56,7 @@ class LSTM(FrameNetwork):
 
     def __init__(self, options: LSTMOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
+        self.grid: ParticleGrid | None = score_grid(info)
         latent = options.latent
         encoder_widths = (self.input_features, *options.encoder, latent)
         decoder_widths = (latent, *options.decoder, self.features)
@@ -90,26 +89,20 @@ class LSTM(FrameNetwork):
         """
         truth, predicted = self.predict_last_frame(batch, generator)
         errors = self.frame_state.squared_errors(truth, predicted)
-        box = self.info.box
-        if box.dimension != 2 or box.is_periodic:
-            return errors
-        true_density = self._density(truth)
-        predicted_density = self._density(predicted)
-
-        difference = predicted_density - true_density
-        squared_error = difference.square().sum()
-        true_square = true_density.square().sum()
-        errors["density"] = squared_error / true_square
+        if self.grid is not None:
+            densities = []
+            windows, particles, _ = truth.shape
+            numbers = torch.arange(windows, device=truth.device)
+            sample = numbers.repeat_interleave(particles)
+            for state in (truth, predicted):
+                position = self.frame_state.position(state).flatten(0, 1)
+                stencil = self.grid.stencil(self.grid.box.inside(position), sample)
+                one = torch.ones_like(position[:, :1])
+                densities.append(self.grid.spread(stencil, one, windows))
+            true_density, predicted_density = densities
+            squared_error = (predicted_density - true_density).square().sum()
+            errors["density"] = squared_error / true_density.square().sum()
         return errors
-
-    def _density(self, state: Tensor) -> Tensor:
-        """Return the weights at the nodes of the scorer's grid [1]."""
-        placement = Placement(self.info.score_placement)
-        grid = Grid(self.info.score_cells, placement)
-        position = self.frame_state.position(state)
-        at_rest = torch.zeros_like(position)
-        sums = transfer(position, at_rest, grid)
-        return sums.weight
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""

@@ -22,10 +22,8 @@ from torch.nn.functional import embedding_bag
 from lagbench.data.box import AXES, Box
 from lagbench.tensors import TensorBox
 
+from .baseline import DatasetInfo
 from .graph import Bounds, wall_distance
-from .torch_grid import number_nodes, spline_weights, three_places
-
-__all__ = ["ParticleGrid", "Stencil"]
 
 
 class Stencil(NamedTuple):
@@ -167,45 +165,75 @@ class ParticleGrid(nn.Module):
             position: positions [length], shape [particle, axis].
             layer: layer of nodes of each particle, int64, shape [particle].
         """
-        corner, offset = self._locate(position)
-        shape = self.shape
-        places = three_places(corner.long())
-        for axis, is_periodic in enumerate(self.periodic):
-            if is_periodic:
-                places[axis] = places[axis] % shape[axis]
-        node = number_nodes(layer, places, shape)
-        weight = spline_weights(offset)
-        return Stencil(weight.flatten(1), node.flatten())
-
-    def _locate(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lowest node of each particle's stencil, and the distance from it.
-
-        The stencil has three nodes along each axis. The distance is in cells. Along a
-        periodic axis the lowest node may have a number below 0.
-        """
         first_places = [axis[0] for axis in self.axes]
         origin = torch.stack(first_places)
         distance = position - origin
-        s = distance / self.cell.to(position)
-        corner = torch.floor(s.detach() - 0.5)
+        s = distance / self.cell.to(position)  # in cells
+        corner = torch.floor(s.detach() - 0.5)  # lowest of three nodes along each axis
         # NaN must not become an index.
         corner = corner.nan_to_num(0.0)
 
         # On the far wall the third node has weight 0 and may not exist: the stencil
-        # stays inside.
+        # stays inside. Along a periodic axis the lowest node may have a number below 0.
         first = []
         last = []
         for is_periodic, nodes in zip(self.periodic, self.shape, strict=True):
-            if is_periodic:
-                first.append(-math.inf)
-                last.append(math.inf)
-            else:
-                first.append(0.0)
-                last.append(nodes - 3.0)
-        lowest = s.new_tensor(first)
-        highest = s.new_tensor(last)
-        corner = corner.clamp(lowest, highest)
-        return corner, s - corner
+            first.append(-math.inf if is_periodic else 0.0)
+            last.append(math.inf if is_periodic else nodes - 3.0)
+        corner = corner.clamp(s.new_tensor(first), s.new_tensor(last))
+        s = s - corner
+
+        # the spline at three nodes along each axis, shape [particle, 3, axis]
+        near = 0.5 * (1.5 - s) ** 2
+        middle = 0.75 - (s - 1.0) ** 2
+        far = 0.5 * (s - 0.5) ** 2
+        values = torch.stack([near, middle, far], dim=1)
+        weight = values[:, :, None, 0] * values[:, None, :, 1]
+        if self.dimension == 3:
+            weight = weight[..., None] * values[:, None, None, :, 2]
+
+        # Nodes are numbered through all layers, the last axis fastest.
+        offset = torch.arange(3, device=position.device)
+        one_node = [1] * self.dimension
+        node = layer.view(-1, *one_node)
+        for axis, lowest in enumerate(corner.long().unbind(dim=1)):
+            place = lowest[:, None] + offset
+            if self.periodic[axis]:
+                place = place % self.shape[axis]
+            along_axis = list(one_node)
+            along_axis[axis] = 3
+            node = node * self.shape[axis] + place.view(-1, *along_axis)
+        return Stencil(weight.flatten(1), node.flatten())
+
+    def momenta(
+        self, position: Tensor, velocity: Tensor, sample: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return weights and momenta at the nodes.
+
+        The weights [1] have shape [window, x node, y node], the momenta [unit of the
+        velocity] [window, axis, x node, y node]. Particles beyond a wall count on it.
+
+        Args:
+            position: positions [length], shape [particle, axis].
+            velocity: shape [particle, axis].
+            sample: window of each particle, ascending, shape [particle].
+        """
+        stencil = self.stencil(self.box.inside(position), sample)
+        one = torch.ones_like(velocity[:, :1])
+        value = torch.cat([one, velocity], dim=1)
+        sums = self.spread(stencil, value, int(sample[-1]) + 1)
+        return sums[:, 0], sums[:, 1:]
+
+    def slopes(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return central differences along x and y at the inner nodes [unit/length].
+
+        The field has shape [..., x node, y node]. The box has two dimensions.
+        """
+        right = field[..., 2:, 1:-1]
+        left = field[..., :-2, 1:-1]
+        above = field[..., 1:-1, 2:]
+        below = field[..., 1:-1, :-2]
+        return (right - left) / (2 * self.spacing), (above - below) / (2 * self.spacing)
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
         """Return the weighted sums of the particles' values at the nodes (P2G).
@@ -296,3 +324,14 @@ class ParticleGrid(nn.Module):
         # a wall on nodes has its neighbours at 1, up to rounding
         is_beside = distance.abs() < 0.999
         return is_beside.to(torch.float32)
+
+
+def score_grid(info: DatasetInfo) -> ParticleGrid | None:
+    """Return a grid with the spacing of the scorer's, for losses of fields.
+
+    There is one in two dimensions between walls only.
+    """
+    if info.box.dimension != 2 or info.box.is_periodic:
+        return None
+    widest_side = float(info.box.lengths.max())
+    return ParticleGrid(info.bounds, max(1, round(widest_side * info.score_cells)))

@@ -328,7 +328,6 @@ class _TimedRollouts:
         radius = getattr(self.model, "radius", None)
         if radius is None:
             return
-        most = getattr(self.model.options, "neighbours", None)
         positions = torch.cat([rollout.position for rollout in rollouts], dim=1)
         positions = positions.to(self._machine)
         stride = max(1, len(positions) // TIMED_SEARCHES)
@@ -338,7 +337,6 @@ class _TimedRollouts:
                 positions[frame],
                 float(radius),
                 given.sample,
-                most=most,
                 box=self.info.box,
             )
             elapsed = self._read_clock() - start_time

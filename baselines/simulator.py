@@ -28,11 +28,10 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator
-from lagbench.data.box import UNIT_SQUARE, Box
-from lagbench.data.grid import Grid, Placement
+from lagbench.data.grid import COUNTED_SHARE, EMPTY_SHARE
 from lagbench.errors import UsageError
 
-from .augmentation import Symmetry, augment, draw_waves, velocity_towards_path
+from .augmentation import Symmetry, augment, velocity_towards_path
 from .baseline import (
     Baseline,
     Batch,
@@ -51,8 +50,8 @@ from .graph import (
     radius_graph,
 )
 from .network import EncodeProcessDecode, LayeredNetwork
+from .particle_grid import ParticleGrid, score_grid
 from .relaxation import Relaxation
-from .torch_grid import TensorFields, tensor_fields, transfer
 
 
 class Motion(NamedTuple):
@@ -115,124 +114,69 @@ GRID_TERMS = ("density", "divergence", "vorticity")
 TERMS = PARTICLE_TERMS + GRID_TERMS
 
 
-class LossNorm(enum.StrEnum):
-    """The p of the norms: L2 is the squared error, L1 the absolute one."""
-
-    L1 = "l1"
-    L2 = "l2"
-
-
-def mean_norm(
-    error: Tensor, norm: LossNorm, count: Tensor | int | None = None
-) -> Tensor:
-    """Return ``(1/N) sum_i ||e_i||_p`` of normalised errors (Eqs. 5.29-5.34).
-
-    The errors have shape [..., component]. N counts particles or nodes, by default
-    those of the array.
-    """
-    if norm is LossNorm.L2:
-        magnitude = error**2
-    else:
-        magnitude = error.abs()
-    if count is None:
-        count = magnitude[..., 0].numel()
-    return magnitude.sum() / count
-
-
 def loss_terms(
     predicted: Motion,
     target: Motion,
     sample: Tensor,
     *,
-    grid: Grid,
+    grid: ParticleGrid | None,
     scales: Mapping[str, Tensor],
-    norm: LossNorm,
-    weights: Mapping[str, float],
 ) -> dict[str, Tensor]:
-    """Return the terms of the loss without their weights.
+    """Return the terms of the loss without their weights (Eqs. 5.29-5.34, p = 2).
 
-    Terms of weight 0 have no graph of gradients. In three dimensions and in periodic
-    boxes there are no terms of the grid.
+    A term is ``(1/N) sum_i ||e_i||^2`` of normalised errors at N particles or nodes.
+    Density is over the mean node weight around a true particle: that is the full weight
+    of a box that is full, and it is defined for a splash too. Divergence and vorticity
+    count at nodes whose four neighbours have enough true matter.
 
     Args:
         predicted: predicted motion.
         target: true motion.
         sample: window of each particle, ascending, shape [particle].
-        grid: grid of density, divergence and vorticity.
+        grid: grid of density, divergence and vorticity; None leaves them out.
         scales: deviations of errors, one along each axis, by the names in
             :class:`Motion`.
-        norm: norm of the errors.
-        weights: weights by term; a missing one is 1.
     """
     terms: dict[str, Tensor] = {}
     for name in PARTICLE_TERMS:
-        with _record_graph(weights, name):
-            predicted_value = getattr(predicted, name)
-            true_value = getattr(target, name)
-            error = predicted_value - true_value
-            terms[name] = mean_norm(error / scales[name], norm)
-    if grid.dimension != 2 or grid.box.is_periodic:
+        error = (getattr(predicted, name) - getattr(target, name)) / scales[name]
+        terms[name] = (error**2).sum() / len(error)
+    if grid is None:
         return terms
 
     with torch.no_grad():
-        true_fields = _target_fields(target, grid, sample)
-    with _record_graph(weights, *GRID_TERMS):
-        predicted_fields = _predicted_fields(predicted, true_fields, sample)
+        weight, momentum = grid.momenta(target.position, target.velocity, sample)
+        full = (weight**2).sum() / weight.sum()
+        is_counted = weight >= COUNTED_SHARE * full
+        along_x = is_counted[:, 2:, 1:-1] & is_counted[:, :-2, 1:-1]
+        along_y = is_counted[:, 1:-1, 2:] & is_counted[:, 1:-1, :-2]
+        is_inner = along_x & along_y
+        true_velocity = _node_velocity(weight, momentum, full)
+    predicted_weight, momentum = grid.momenta(
+        predicted.position, predicted.velocity, sample
+    )
+    density_error = (predicted_weight - weight) / full
+    terms["density"] = (density_error**2).sum() / density_error.numel()
 
-    with _record_graph(weights, "density"):
-        error = predicted_fields.density - true_fields.density
-        terms["density"] = mean_norm(error.unsqueeze(-1), norm)
-    node_count = true_fields.differentiable.sum()
-    node_count = node_count.clamp(min=1)
-    variance = scales["velocity"] ** 2
-    speed = variance.mean().sqrt()
-    for name in ("divergence", "vorticity"):
-        with _record_graph(weights, name):
-            predicted_value = getattr(predicted_fields, name)
-            true_value = getattr(true_fields, name)
-            difference = predicted_value - true_value
-            error = difference / speed
-            terms[name] = mean_norm(error.unsqueeze(-1), norm, node_count)
+    error = _node_velocity(predicted_weight, momentum, full) - true_velocity
+    slope_x, slope_y = grid.slopes(error)
+    node_count = is_inner.sum().clamp(min=1)
+    variance = (scales["velocity"] ** 2).mean()
+    for name, rates in (
+        ("divergence", slope_x[:, 0] + slope_y[:, 1]),
+        ("vorticity", slope_x[:, 1] - slope_y[:, 0]),
+    ):
+        terms[name] = ((rates * is_inner) ** 2).sum() / variance / node_count
     return terms
 
 
-def _target_fields(target: Motion, grid: Grid, sample: Tensor) -> TensorFields:
-    """Return the fields of the truth, over the mean node weight around a particle.
-
-    That is the full weight of a box that is full, and it is defined for a splash too,
-    whose area is not known here.
-    """
-    windows = int(sample[-1]) + 1
-    sums = transfer(
-        target.position, target.velocity, grid, sample=sample, windows=windows
-    )
-    square_sum = (sums.weight**2).sum()
-    weight_sum = sums.weight.sum()
-    full_weight = float(square_sum / weight_sum)
-    return tensor_fields(sums, grid, full_weight)
-
-
-def _predicted_fields(
-    predicted: Motion, true_fields: TensorFields, sample: Tensor
-) -> TensorFields:
-    """Return the fields of the prediction on the grid of the truth.
-
-    Density and velocity are those of all nodes. Vorticity and divergence are 0 except
-    at nodes where those of the truth are defined.
-    """
-    windows = int(sample[-1]) + 1
-    grid = true_fields.grid
-    sums = transfer(
-        predicted.position, predicted.velocity, grid, sample=sample, windows=windows
-    )
-    return tensor_fields(sums, grid, true_fields.full_weight, true_fields.counted)
-
-
-def _record_graph(weights: Mapping[str, float], *names: str) -> torch.set_grad_enabled:
-    """Record a graph only if torch records one and one of the terms has a weight."""
-    is_weighted = any(weights.get(name, 1.0) != 0.0 for name in names)
-    is_recorded = torch.is_grad_enabled() and is_weighted
-    return torch.set_grad_enabled(is_recorded)
+def _node_velocity(weight: Tensor, momentum: Tensor, full: Tensor) -> Tensor:
+    """Return mean velocities at the nodes, 0 where there is hardly any matter."""
+    is_filled = (weight >= EMPTY_SHARE * full) & (weight > 0.0)
+    # Empty nodes divide by 1: a quotient that `where` drops must not have an infinite
+    # gradient.
+    divisor = torch.where(is_filled, weight, 1.0)
+    return torch.where(is_filled[:, None], momentum / divisor[:, None], 0.0)
 
 
 class GraphTarget(enum.StrEnum):
@@ -264,13 +208,9 @@ class GraphNetworkOptions(Options):
 
     in_training = frozenset(
         {
-            "forgetful",
             "noise_std",
             "noise_spread",
-            "compression",
             "loss",
-            "loss_norm",
-            "link_weight",
             "pushforward",
             "recovery",
             "rollout_loss_steps",
@@ -278,6 +218,14 @@ class GraphNetworkOptions(Options):
         }
     )
     of_weights = frozenset({"target", "sum_messages", "body_force", "obstacle"})
+    retired: ClassVar[Mapping[str, object]] = {
+        "forgetful": 0.0,
+        "compression": 0.0,
+        "loss_norm": "l2",
+        "link_weight": None,
+        "neighbours": None,
+        "clamp": True,
+    }
 
     latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
     layers: int = Field(default=10, ge=1)  # processor layers
@@ -285,9 +233,6 @@ class GraphNetworkOptions(Options):
     # which is the sum itself
     sum_messages: bool = True
     velocities: int = Field(default=5, ge=1)  # last velocities that a particle shows
-    # share of training windows in which the oldest velocities are repeats of a later
-    # one, as they are at the start of rollouts
-    forgetful: float = Field(default=0.0, ge=0.0, le=1.0)
     target: GraphTarget = GraphTarget.ACCELERATION  # what the network predicts
     # deviation of the noise on the last given velocity, per component [length/frame];
     # with noise_spread the largest one. Rollouts drift away with little noise, and
@@ -296,14 +241,7 @@ class GraphNetworkOptions(Options):
     # whether each window draws the deviation of its noise, from none to noise_std: the
     # model then learns from true states and from far ones
     noise_spread: bool = False
-    # Three waves displace the particles of each training window. This is the largest
-    # strain of one wave; each draws its own, from 0. With recovery the model learns to
-    # even out densities.
-    compression: float = Field(default=0.0, ge=0.0, le=1.0)
     loss: LossWeights = LossWeights()  # weights of the terms
-    loss_norm: LossNorm = LossNorm.L2  # L2 or L1
-    # weight of an operator's link prediction; the operator's own when None
-    link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     # steps over which the loss is a mean; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
     # largest number of own steps before those, without gradients: training then sees
@@ -326,14 +264,9 @@ class GraphNetworkOptions(Options):
     symmetry: Symmetry = Symmetry.NONE
     # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    # neighbours of a particle at most, the nearest; all within the radius when None
-    neighbours: int | None = Field(default=None, ge=1)
     # how far matter acts on matter; walls act half as far [radius]. A body that nothing
     # reaches gets one learned mean acceleration. None leaves it to the network.
     free_flight: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    # keep particles in the box and out of the obstacle, and their velocities true to
-    # that, in training and in rollouts
-    clamp: bool = True
     # iterations after each step of a rollout that move crowded particles apart; 0 for
     # none
     relaxation: int = Field(default=0, ge=0)
@@ -360,8 +293,7 @@ class GraphNetwork(Baseline):
         self.radius = info.radius
         if options.radius is not None:
             self.radius = options.radius
-        placement = Placement(info.score_placement)
-        self.grid = Grid(info.score_cells, placement, self._grid_box)
+        self.grid = score_grid(info)
         # Noise on the inputs widens velocities and accelerations.
         noise = options.noise_std
         self.position = self._standardisation("position", noise=0.0)
@@ -437,24 +369,8 @@ class GraphNetwork(Baseline):
                 "noise_spread needs model.noise_std above 0",
             ),
             (
-                options.compression > 0.0 and options.recovery is None,
-                "compression needs model.recovery, as 8",
-            ),
-            (
                 options.free_flight is not None and is_forced,
                 "free_flight knows no force but gravity, and no obstacle",
-            ),
-            (
-                options.relaxation > 0 and not options.clamp,
-                "relaxation keeps particles in the box: leave model.clamp=true",
-            ),
-            (
-                options.relaxation > 0 and options.neighbours is not None,
-                "relaxation needs all neighbours: leave model.neighbours out",
-            ),
-            (
-                options.link_weight is not None and "link" not in self.operator.weights,
-                "link_weight is for operators that predict links, as supergat",
             ),
         )
         for is_contradiction, words in contradictions:
@@ -470,14 +386,6 @@ class GraphNetwork(Baseline):
     def acceleration_std(self) -> float:
         """Deviation of true accelerations, of one component [length/frame^2]."""
         return root_mean_square(self.info.statistics["acceleration_std"])
-
-    @property
-    def _grid_box(self) -> Box:
-        """Box of the loss's grid: the unit square where there are only walls."""
-        box = self.info.box
-        if box.dimension == 2 and not box.is_periodic:
-            return UNIT_SQUARE
-        return box
 
     def _standardisation(self, name: str, *, noise: float) -> Standardisation:
         statistics = self.info.statistics
@@ -514,10 +422,7 @@ class GraphNetwork(Baseline):
     @property
     def weights(self) -> Mapping[str, float]:
         """Weight of each term of the loss, the operator's own included."""
-        operator_weights = dict(self.operator.weights)
-        if self.options.link_weight is not None:
-            operator_weights["link"] = self.options.link_weight
-        return self.options.loss.model_dump() | operator_weights
+        return self.options.loss.model_dump() | dict(self.operator.weights)
 
     def compile_layers(self) -> None:
         """Compile the network's layers."""
@@ -545,9 +450,6 @@ class GraphNetwork(Baseline):
                 batch = replace(batch, position=position)
         given = batch.part(slice(self.history))
         state = self.start(given)
-        if generator is not None:
-            state = self._forget(state, batch.windows, generator)
-            state = self._compress(state, batch.windows, generator)
         first_frame = self.history  # the first frame whose error counts
         if generator is not None and self.options.pushforward:
             state, frame_count = self._push_forward(state, generator)
@@ -568,29 +470,6 @@ class GraphNetwork(Baseline):
             of_steps = torch.stack(values)
             means[name] = of_steps.mean()
         return means
-
-    def _compress(
-        self, state: ParticleState, windows: int, generator: torch.Generator
-    ) -> ParticleState:
-        """Return the state with particles displaced by random waves.
-
-        Their velocities stay: only the density changes, as in a rollout that has
-        drifted off.
-        """
-        strain = self.options.compression
-        if strain == 0.0:
-            return state
-        displacement = draw_waves(
-            state.position,
-            state.sample,
-            windows,
-            generator,
-            strain=strain,
-            shortest=self.radius,
-            period=self.box.period,
-        )
-        position = self._keep_inside(state.position + displacement)
-        return replace(state, position=position)
 
     @torch.no_grad()
     def _push_forward(
@@ -651,39 +530,7 @@ class GraphNetwork(Baseline):
             state.sample,
             grid=self.grid,
             scales=scales,
-            norm=self.options.loss_norm,
-            weights=self.weights,
         )
-
-    def _forget(
-        self, state: ParticleState, windows: int, generator: torch.Generator
-    ) -> ParticleState:
-        """Return the state after some windows forgot their oldest velocities.
-
-        The option ``forgetful`` is the probability that a window forgets. The first
-        velocity that is left stands in place of the forgotten ones before it.
-        """
-        velocities = self.options.velocities
-        if self.options.forgetful == 0.0 or velocities == 1:
-            return state
-        device = generator.device
-        forgotten = torch.randint(
-            1, velocities, (windows,), generator=generator, device=device
-        )
-        chance = torch.rand(windows, generator=generator, device=device)
-        is_forgetful = chance < self.options.forgetful
-        forgotten *= is_forgetful
-
-        sample = state.sample
-        forgotten = forgotten.to(sample.device)
-        first = forgotten[sample, None]  # first velocity that is left, [particle, 1]
-        particles = len(first)
-        places = torch.arange(velocities, device=sample.device)
-        places = places.expand(particles, -1)
-        source = places.clamp(min=first)
-        source = source[..., None].expand_as(state.velocity)
-        velocity = state.velocity.gather(1, source)
-        return replace(state, velocity=velocity)
 
     def start(self, given: Batch) -> ParticleState:
         """Return the state after the given frames.
@@ -761,7 +608,6 @@ class GraphNetwork(Baseline):
             state.position.detach(),
             self.radius,
             state.sample,
-            most=self.options.neighbours,
             box=self.info.box,
         )
 
@@ -808,8 +654,6 @@ class GraphNetwork(Baseline):
 
         A clamp would have no gradient at a wall.
         """
-        if not self.options.clamp:
-            return position
         constant = position.detach()
         clamped = self.box.inside(constant)
         zero = position - constant
@@ -823,8 +667,6 @@ class GraphNetwork(Baseline):
             obstacle: centre and radius of each particle's obstacle [length], shape
                 [particle, axis + 1].
         """
-        if not self.options.clamp:
-            return position
         constant = position.detach()
         outside = self.box.outside(constant, obstacle)
         zero = position - constant

@@ -105,9 +105,9 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
         "--no-bench",
     )
     assert lagbench(*predict, "--set", "model.latent=7").exit_code == 2
-    predicted = lagbench(*predict, "--set", "model.clamp=false")
+    predicted = lagbench(*predict, "--set", "model.relaxation=1")
     with netCDF4.Dataset("predictions.nc") as data:
-        assert "model.clamp=false" in data.getncattr("training")
+        assert "model.relaxation=1" in data.getncattr("training")
     assert "without the neighbour search" in predicted.stdout
     assert "in place of" not in predicted.stdout
     refused = lagbench(*predict)

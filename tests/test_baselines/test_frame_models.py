@@ -341,9 +341,11 @@ def test_the_density_term_compares_maps() -> None:
     position = predicted.detach().numpy()
 
     def transfer_weight(position: NDArray[np.floating[Any]]) -> Array:
-        grid = Grid(8, Placement.CELL_CENTRES)
+        # a grid of as wide cells, with one more node beyond each wall
+        grid = Grid(10, Placement.CELL_CENTRES)
         at_rest = np.zeros_like(position)
-        return gridding.transfer(position, at_rest, grid).weight
+        moved = (np.clip(position, 0.0, 1.0) * 8 + 1) / 10
+        return gridding.transfer(moved, at_rest, grid).weight
 
     weight = transfer_weight(position)
     true_weight = transfer_weight(window[3])

@@ -83,13 +83,9 @@ OTHER = {
         "recovery": 4.0,
         "noise_std": 0.5,
         "noise_spread": True,
-        "compression": 0.5,
-        "forgetful": 0.7,
-        "loss_norm": "l1",
     },
     **{
         "loss": {"vorticity": 3.0},
-        "link_weight": 2.0,
         "rollout_loss_steps": 3,
         "symmetry": "square",
     },

@@ -369,35 +369,3 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     assert bool(is_changed[is_near].all())
     # One layer: a particle hears of the walls of its neighbours at most.
     assert not bool(is_changed[is_far].any())
-
-
-def test_forgetful_windows_start_from_their_last_frames() -> None:
-    """Every number of frames comes up, except all of them."""
-    windows = [swirl(seed, 7) for seed in range(24)]
-    window = batch(*windows)
-    options = SMALL | {"forgetful": 1.0}
-    model = RecordingNetwork.build(options, info())
-    model(window, seeded())
-    velocity = model.states[0].velocity
-
-    velocity_by_frame_count = {}
-    for frame_count in range(2, 7):
-        short = window.part(slice(6 - frame_count, 6))
-        state = model.start(short)
-        velocity_by_frame_count[frame_count] = state.velocity
-    frame_counts = set()
-    for sample in range(24):
-        members = window.sample == sample
-        sample_velocity = velocity[members]
-        matches = []
-        for frame_count, start_velocity in velocity_by_frame_count.items():
-            if torch.equal(sample_velocity, start_velocity[members]):
-                matches.append(frame_count)
-        assert len(matches) == 1
-        frame_counts.update(matches)
-    assert frame_counts == {2, 3, 4, 5}
-
-    # In validation there is no generator, and windows forget nothing.
-    model(window)
-    all_velocities = velocity_by_frame_count[6]
-    assert torch.equal(model.states[1].velocity, all_velocities)
