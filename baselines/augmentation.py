@@ -73,10 +73,11 @@ def check_symmetry(symmetry: object, size: Size, forcing: Collection[str]) -> No
         )
     if symmetry != Symmetry.SQUARE:
         return
-    if len(set(size.box.periodic)) > 1:
+    lengths = size.box.lengths
+    if len(set(size.box.periodic)) > 1 or lengths.max() - lengths.min() > 1e-6:
         raise UsageError(
-            f"only some axes of {size.split} are periodic: axes cannot change "
-            "places; set model.symmetry=mirror",
+            f"the axes of {size.split} differ in length or in period: they cannot "
+            "change places; set model.symmetry=mirror",
             where="model.symmetry",
         )
     gravity = size.parameters.get("gravity")
@@ -221,25 +222,8 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         matrix: signed permutation of the axes for each window, shape [window, axis,
             axis].
         bounds: box (low, high) along each axis [length].
-
-    Raises:
-        UsageError: axes change places in a box whose sides differ, or the y axis does
-            so where a force acts on layers along it.
     """
-    lengths = []
-    middles = []
-    for low, high in bounds:
-        lengths.append(high - low)
-        middles.append((low + high) / 2)
-    largest_difference = max(lengths) - min(lengths)
-    diagonal = matrix.diagonal(dim1=1, dim2=2)
-    changes_place = diagonal == 0.0
-    if largest_difference > 1e-6 and bool(changes_place.any()):
-        raise UsageError(
-            "axes cannot change places in this box: "
-            f"{', '.join(f'{length:g}' for length in lengths)}; use symmetry: mirror",
-            where="symmetry",
-        )
+    middles = [(low + high) / 2 for low, high in bounds]
     matrix = matrix.to(batch.position)
     centre = batch.position.new_tensor(middles)
     by_particle = matrix[batch.sample]
@@ -260,7 +244,9 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         walls = walls.gather(2, source_walls)
     force = batch.body_force
     if force is not None:
-        force = _mirror_force(force, matrix)
+        image = _multiply(matrix[:, None, None], force)
+        is_upside_down = matrix[:, 1, 1] < 0.0
+        force = torch.where(is_upside_down[:, None, None, None], image.flip(2), image)
     obstacle = batch.obstacle
     if obstacle is not None:
         radius = obstacle[:, -1:]
@@ -275,30 +261,6 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         body_force=force,
         obstacle=obstacle,
     )
-
-
-def _mirror_force(force: Tensor, matrix: Tensor) -> Tensor:
-    """Return the mirror image of a force on layers along y.
-
-    Args:
-        force: shape [window, frame, layer, axis].
-        matrix: signed permutation of the axes for each window.
-
-    Raises:
-        UsageError: the y axis changes places with another one.
-    """
-    sign = matrix[:, 1, 1]
-    if bool((sign == 0.0).any()):
-        raise UsageError(
-            "a force acts on layers along y, which cannot change places with an axis: "
-            "a rotation; use symmetry: mirror",
-            where="symmetry",
-        )
-    image = _multiply(matrix[:, None, None], force)
-    reversed_layers = image.flip(2)
-    is_upside_down = sign < 0.0
-    is_reversed = is_upside_down[:, None, None, None]
-    return torch.where(is_reversed, reversed_layers, image)
 
 
 def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Batch:
@@ -445,17 +407,6 @@ def velocity_towards_path(
     return velocity * limit / divisor
 
 
-def draw_noise_levels(most: float, batch: Batch, generator: torch.Generator) -> Tensor:
-    """Draw a deviation for each window, uniformly up to the largest one.
-
-    The result holds that of each particle's window, shape [particle, 1, 1].
-    """
-    level = torch.rand(batch.windows, generator=generator, device=generator.device)
-    sample = batch.sample.to(level.device)
-    by_particle = level[sample]
-    return most * by_particle[:, None, None]
-
-
 def augment(
     model: Baseline,
     batch: Batch,
@@ -481,7 +432,10 @@ def augment(
     if noise_std > 0.0:
         deviation: float | Tensor = noise_std
         if noise_spread:
-            deviation = draw_noise_levels(noise_std, batch, generator)
+            device = generator.device
+            share = torch.rand(batch.windows, generator=generator, device=device)
+            by_particle = share[batch.sample.to(device)]
+            deviation = noise_std * by_particle[:, None, None]
         position = add_walk_noise(batch.position, model.history, deviation, generator)
         batch = replace(batch, position=position)
     return batch

@@ -12,28 +12,15 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import compress
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 
-from lagbench.data.box import AXES, Box, parse_periodic
+from lagbench.data.box import Box, parse_periodic
 from lagbench.errors import UsageError
 from lagbench.tensors import Batch, TensorBox
-
-__all__ = [
-    "Baseline",
-    "Batch",
-    "DatasetInfo",
-    "Options",
-    "Settings",
-    "check_moving_walls",
-    "count_parameters",
-    "last_velocities",
-    "rescale",
-]
 
 
 class Settings(BaseModel):
@@ -132,31 +119,13 @@ class Baseline(nn.Module):
         """Refuse a periodic box or a cube if the model does not know them."""
         if cls.any_box:
             return
-        if box.is_periodic:
-            periodic = compress(AXES, box.periodic)
+        if box.is_periodic or box.dimension != 2:
             raise UsageError(
-                f"{cls.method} knows boxes with walls only: periodic along "
-                f"{', '.join(periodic)}; {cls._fix_box()}",
+                f"{cls.method} knows boxes of two dimensions between walls only; train "
+                "neuralmpm, or a graph network such as gns; or state any_box = True in "
+                "its class",
                 where=where,
             )
-        if box.dimension != 2:
-            raise UsageError(
-                f"{cls.method} knows two dimensions only: {box.dimension} axes; "
-                f"{cls._fix_box()}",
-                where=where,
-            )
-
-    @classmethod
-    def _fix_box(cls) -> str:
-        """Return what helps where the model does not know a box."""
-        advice = "train neuralmpm, or a graph network such as gns"
-        package = cls.__module__
-        if not package.startswith("lagbench."):
-            advice += (
-                f"; or, if {cls.__name__} of {package} knows such boxes, state "
-                "any_box = True in its class"
-            )
-        return advice
 
     @classmethod
     def build(cls, options: Mapping[str, object], info: DatasetInfo) -> Self:
@@ -246,9 +215,7 @@ def count_parameters(model: Baseline) -> int:
     return count
 
 
-def last_velocities(
-    position: Tensor, count: int, box: TensorBox | None = None
-) -> Tensor:
+def last_velocities(position: Tensor, count: int, box: TensorBox) -> Tensor:
     """Return the last velocities of given frames, oldest first.
 
     They have shape [particle, count, axis] and the unit length/frame. Where the frames
@@ -257,18 +224,13 @@ def last_velocities(
     Args:
         position: given frames [length], shape [particle, frame, axis].
         count: number of velocities.
-        box: box that holds the particles; None for one with walls only.
+        box: box that holds the particles.
 
     Raises:
         UsageError: there are fewer than two frames.
     """
     frames = position[:, -count - 1 :]
-    if box is None:
-        velocity = frames.diff(dim=1)
-    else:
-        before = frames[:, :-1]
-        after = frames[:, 1:]
-        velocity = box.displacement(before, after)
+    velocity = box.displacement(frames[:, :-1], frames[:, 1:])
     if not velocity.shape[1]:
         raise UsageError(
             f"too few frames to start from: got {position.shape[1]}, expected 2 or "

@@ -147,7 +147,7 @@ def edge_features(
     position: Tensor,
     edge_index: Tensor,
     radius: float,
-    box: TensorBox | None = None,
+    box: TensorBox,
 ) -> Tensor:
     """Return displacement and distance of each edge over the radius, [edge, axis + 1].
 
@@ -157,16 +157,12 @@ def edge_features(
         position: positions [length], shape [particle, axis].
         edge_index: senders and receivers, int64, shape [2, edge].
         radius: connectivity radius [length].
-        box: box that holds the particles; None for one with walls only.
+        box: box that holds the particles.
     """
     sender, receiver = edge_index
     sender_position = position.index_select(0, sender)
     receiver_position = position.index_select(0, receiver)
-    if box is None:
-        way = sender_position - receiver_position
-    else:
-        way = box.displacement(receiver_position, sender_position)
-    displacement = way / radius
+    displacement = box.displacement(receiver_position, sender_position) / radius
     distance = safe_length(displacement)
     return torch.cat([displacement, distance], dim=-1)
 

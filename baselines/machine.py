@@ -55,17 +55,6 @@ def use_threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def read_load() -> float | None:
-    """Return how many processes wanted to run, the mean over the last minute.
-
-    None where the system does not tell.
-    """
-    try:
-        return round(os.getloadavg()[0], 2)
-    except (OSError, AttributeError):  # AttributeError: Windows
-        return None
-
-
 def hardware(device: str = "cpu") -> dict[str, Any]:
     """Return processor, cores, threads and device, without the machine's name."""
     device_name = "cpu"

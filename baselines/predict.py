@@ -1,9 +1,8 @@
 """Predict: roll a trained model out over the test scenarios into a predictions.nc.
 
 Only the given frames of the test subset are read. Times are those of rollouts alone,
-after one step to warm up; the time of the neighbour search is measured on frames of the
-same rollouts. On a CPU the cost is the processor time of all threads: other work on the
-machine does not count, and it compares with that of a solver on one core.
+after one step to warm up. On a CPU the cost is the processor time of all threads: other
+work on the machine does not count, and it compares with that of a solver on one core.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.writer import PredictionsWriter, check_predictions_output
-from lagbench.tensors import Batch
 from lagbench.work.run import Meter, Progress
 
 from .augmentation import check_symmetry
@@ -31,11 +29,9 @@ from .baseline import Baseline, DatasetInfo, count_parameters, rescale
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .dataset_info import find_forcing
-from .graph import radius_graph
 from .machine import (
     choose_device,
     hardware,
-    read_load,
     use_threads,
 )
 from .recipe import change_options
@@ -46,8 +42,6 @@ from .rollout import (
     scenario_batch,
     scenario_paths,
 )
-
-TIMED_SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,15 +59,11 @@ class PredictionResult:
     batch: int  # scenarios that were rolled out side by side
     # time of one frame of one scenario by the clock below [s]
     seconds_per_frame: float
-    seconds_without_search: float  # the same without the neighbour search [s]
     # 'processor' on a CPU: of all threads together, without other work on the machine;
     # 'wall' on a GPU
     clock: str
     wall_seconds_per_frame: float  # time on the wall, other work included [s]
     threads: int  # CPU threads
-    # processes that wanted to run, mean over the last minute; None where the system
-    # does not tell
-    load: float | None
     # of our solver on one core of this machine [s]
     solver_seconds_per_frame: float | None
     device: str  # processor and threads, or GPU
@@ -236,11 +226,9 @@ def predict(
         frames=info.horizon,
         batch=rollouts.side_by_side,
         seconds_per_frame=seconds_per_frame,
-        seconds_without_search=seconds_per_frame - rollouts.search_per_frame,
         clock=rollouts.clock,
         wall_seconds_per_frame=rollouts.wall_seconds / rollouts.frames,
         threads=rollouts.threads,
-        load=read_load(),
         solver_seconds_per_frame=solver_seconds,
         device=label,
         parameters=count_parameters(model),
@@ -296,7 +284,6 @@ class _TimedRollouts:
         self._machine = machine
         # of scenarios whose files state none [length^2/s]
         self._viscosity = viscosity
-        self._search_seconds: list[float] = []  # per frame of one scenario
 
     def __iter__(self) -> Iterator[Rollout]:
         """Yield the rollout of every scenario."""
@@ -320,34 +307,7 @@ class _TimedRollouts:
                 )
                 if rollout.diverged_at is not None:
                     self.diverged[rollout.scenario] = rollout.diverged_at
-            self._time_searches(given_frames, rollouts)
             yield from rollouts
-
-    def _time_searches(self, given: Batch, rollouts: list[Rollout]) -> None:
-        """Search neighbours once more in some frames, and take the time."""
-        radius = getattr(self.model, "radius", None)
-        if radius is None:
-            return
-        positions = torch.cat([rollout.position for rollout in rollouts], dim=1)
-        positions = positions.to(self._machine)
-        stride = max(1, len(positions) // TIMED_SEARCHES)
-        for frame in range(0, len(positions), stride):
-            start_time = self._read_clock()
-            radius_graph(
-                positions[frame],
-                float(radius),
-                given.sample,
-                box=self.info.box,
-            )
-            elapsed = self._read_clock() - start_time
-            self._search_seconds.append(elapsed / len(rollouts))
-
-    @property
-    def search_per_frame(self) -> float:
-        """Time of the neighbour search in it [s]; 0 for a model without one."""
-        if not self._search_seconds:
-            return 0.0
-        return sum(self._search_seconds) / len(self._search_seconds)
 
     def _read_clock(self) -> float:
         if self._machine == "cuda":

@@ -123,48 +123,29 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
 def select_window(batch: Batch, window: int) -> Batch:
     """Return one window of a batch as a batch of its own."""
     is_inside = batch.sample == window
-    row = slice(window, window + 1)
-    sample = batch.sample[is_inside]
-    return Batch(
-        position=batch.position[is_inside],
-        sample=torch.zeros_like(sample),
-        material=batch.material[is_inside],
-        wall_velocity=_rows(batch.wall_velocity, row),
-        scenario=batch.scenario[row],
-        frame=batch.frame[row],
-        origin=_rows(batch.origin, is_inside),
-        viscosity=_rows(batch.viscosity, row),
-        body_force=_rows(batch.body_force, row),
-        obstacle=_rows(batch.obstacle, row),
-        particle_mass=_rows(batch.particle_mass, row),
-        friction=_rows(batch.friction, row),
-    )
-
-
-def _rows(values: Tensor | None, rows: slice | Tensor) -> Tensor | None:
-    """Return some rows of what a batch may hold; None where it does not."""
-    if values is None:
-        return None
-    return values[rows]
+    values = {}
+    for name, value in vars(batch).items():
+        if value is None:
+            continue
+        if name in ("position", "material", "origin"):
+            values[name] = value[is_inside]
+        else:
+            values[name] = value[window : window + 1]
+    values["sample"] = torch.zeros_like(batch.sample[is_inside])
+    return replace(batch, **values)
 
 
 @contextmanager
 def replace_parameters(values: Mapping[Tensor, Tensor]) -> Iterator[None]:
     """Give parameters other values for a while."""
-    originals = {}
-    for parameter in values:
-        originals[parameter] = parameter.detach().clone()
-    _copy_to_parameters(values)
+    originals = {parameter: parameter.detach().clone() for parameter in values}
+    for parameter, value in values.items():
+        parameter.data.copy_(value)
     try:
         yield
     finally:
-        _copy_to_parameters(originals)
-
-
-@torch.no_grad()
-def _copy_to_parameters(values: Mapping[Tensor, Tensor]) -> None:
-    for parameter, value in values.items():
-        parameter.copy_(value)
+        for parameter, value in originals.items():
+            parameter.data.copy_(value)
 
 
 def round_parameters(model: nn.Module) -> AbstractContextManager[None]:

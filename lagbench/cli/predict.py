@@ -13,7 +13,6 @@ from cyclopts.types import NonNegativeInt, PositiveInt
 from lagbench.data.layout import quote_root
 from lagbench.data.registry import load
 from lagbench.errors import UsageError, check_regular, format_count
-from lagbench.work.machine import available_cores
 
 from .model_options import PREDICTION_LIBRARIES, require_libraries
 from .options import (
@@ -238,9 +237,6 @@ def _describe(
     if is_replaced:
         yield "  in place of the predictions that were there"
     cost = f"{result.seconds_per_frame:.3g} s per frame"
-    without_search = f"{result.seconds_without_search:.3g} s"
-    if not cost.startswith(without_search):
-        cost += f" ({without_search} without the neighbour search)"
     yield f"  model   {cost} on {result.device}"
     yield f"          {_describe_clock(result)}"
     yield from _describe_solver(result.seconds_per_frame, solver)
@@ -285,8 +281,6 @@ def _compare_speeds(ratio: float) -> str:
 def _describe_clock(result: PredictionResult) -> str:
     """Return which clock took the time of a model, and what else the machine did."""
     wall = f"{result.wall_seconds_per_frame:.3g} s on the wall"
-    if result.load is not None:
-        wall += f", with a load of {result.load:.1f} on {available_cores()} cores"
     if result.clock == "wall":
         return wall
     threads = format_count(result.threads, "thread")

@@ -98,11 +98,6 @@ def test_images_of_the_force_fit_the_images_of_the_particles(batch: Batch) -> No
     assert image.body_force is not None
     assert_close(image.body_force, force.flip(2))
 
-    swap = for_both_windows([[0.0, 1.0], [1.0, 0.0]])
-    with pytest.raises(UsageError) as caught:
-        mirror_batch(batch, swap, SIZE.bounds)
-    assert caught.value.where == "symmetry"
-
     box = TensorBox(SIZE.box)
     generator = torch.Generator().manual_seed(1)
     moved = shift_batch(batch, box, generator)

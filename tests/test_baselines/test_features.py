@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scipy import stats
 from simple_models import RADIUS, batch, info, jittered, swirl
 from torch.testing import assert_close
 
@@ -13,7 +12,6 @@ from lagbench.baselines.augmentation import (
     Symmetry,
     add_walk_noise,
     draw_mirror_matrices,
-    draw_noise_levels,
     mirror_batch,
 )
 from lagbench.baselines.baseline import Batch
@@ -24,8 +22,11 @@ from lagbench.baselines.graph import (
     radius_graph,
     wall_distance,
 )
+from lagbench.data.box import UNIT_SQUARE
+from lagbench.tensors import TensorBox
 
 BOUNDS = info().bounds
+UNIT_BOX = TensorBox(UNIT_SQUARE)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -102,7 +103,7 @@ def test_edges_show_what_a_loop_over_pairs_shows() -> None:
     position = jittered(3)
     points = torch.from_numpy(position)
     edges = radius_graph(points, RADIUS)
-    features = edge_features(points, edges, RADIUS).numpy()
+    features = edge_features(points, edges, RADIUS, UNIT_BOX).numpy()
 
     expected = []
     for sender, receiver in edges.T.tolist():
@@ -127,7 +128,7 @@ def test_two_particles_in_one_place_have_no_gradient_of_distance() -> None:
     senders = [0, 2]
     receivers = [1, 1]
     edges = torch.tensor([senders, receivers])
-    features = edge_features(position, edges, RADIUS)
+    features = edge_features(position, edges, RADIUS, UNIT_BOX)
     distance = features[:, 2]
     assert distance.tolist() == [0.0, 0.5]
     distance.sum().backward()
@@ -233,8 +234,8 @@ def test_features_do_not_see_where_particles_are() -> None:
     of_nodes = features(position, velocity, material, walls)
     of_shifted_nodes = features(shifted, velocity, material, walls)
     assert torch.equal(of_shifted_nodes, of_nodes)
-    of_edges = edge_features(position, edges, RADIUS)
-    of_shifted_edges = edge_features(shifted, edges, RADIUS)
+    of_edges = edge_features(position, edges, RADIUS, UNIT_BOX)
+    of_shifted_edges = edge_features(shifted, edges, RADIUS, UNIT_BOX)
     assert torch.equal(of_shifted_edges, of_edges)
 
 
@@ -289,21 +290,6 @@ def test_the_target_makes_up_for_the_noise() -> None:
     true_acceleration = true_velocity.diff(dim=1)[:, 4]
     expected = true_acceleration - velocity_noise[:, 4]
     assert_close(acceleration, expected, atol=1e-15, rtol=0)
-
-
-def test_each_window_draws_the_deviation_of_its_noise() -> None:
-    """Levels are uniform up to the largest, the same for all particles of a window."""
-    windows = two_swirls()
-    source = generator(2)
-    drawn = []
-    for _ in range(1000):
-        level = draw_noise_levels(0.5, windows, source)
-        assert level.shape == (len(windows.position), 1, 1)
-        for window in range(windows.windows):
-            of_window = level[windows.sample == window]
-            assert len(of_window.unique()) == 1
-            drawn.append(float(of_window[0]))
-    assert stats.kstest(np.array(drawn) / 0.5, "uniform").pvalue > 1e-3
 
 
 @pytest.mark.parametrize(

@@ -265,7 +265,7 @@ def test_other_work_on_the_machine_does_not_count(
     run: Predict, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
     """The cost of a frame is the processor time of all threads, at any load. The result
-    also has threads, load and wall-clock time.
+    also has threads and wall-clock time.
     """
     advance = Mock(side_effect=Drift.advance)
     clock = SimpleNamespace(
@@ -274,17 +274,14 @@ def test_other_work_on_the_machine_does_not_count(
     )
     monkeypatch.setattr(Drift, "advance", lambda *given: advance(*given))
     monkeypatch.setattr(prediction, "time", clock)
-    monkeypatch.setattr("os.getloadavg", lambda: (5.25, 4.0, 3.0))
     result = run(threads=threads)
     assert result.clock == "processor"
     assert result.seconds_per_frame == 1.0
     assert result.wall_seconds_per_frame == 9.0
     assert result.threads == threads
-    assert result.load == 5.25
     assert f"{threads} thread" in result.device
     cost = json.loads(result.path.with_suffix(".json").read_text())
     assert cost["threads"] == threads
-    assert cost["load"] == 5.25
 
 
 def make_windows(first_x: list[float]) -> Batch:
