@@ -8,19 +8,16 @@ one scenario.
 from __future__ import annotations
 
 import functools
-import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from lagbench.data.field_errors import describe_value
 from lagbench.data.registry import Size
 from lagbench.data.variables import (
     POSSIBLE_NAME,
@@ -29,7 +26,6 @@ from lagbench.data.variables import (
     find_name_fault,
 )
 from lagbench.errors import (
-    LagbenchError,
     UsageError,
     WorkFailedError,
     find_place_in_extension,
@@ -46,10 +42,6 @@ if TYPE_CHECKING:
 
 # particle-substeps between two reports: about a tenth of a second on a core
 STRIDE = 4_000_000
-
-# particles of the initial states that a process keeps, 65 bytes each: a perturbed run
-# starts from the state of a scenario that was simulated some tasks before
-KEPT_PARTICLES = 1 << 17
 
 # drawn parameters that files call by their CF-like long name
 _FILE_NAMES = {"reynolds": "reynolds_number"}
@@ -86,11 +78,10 @@ def start_frame(size: Size, scenario: int) -> int:
         first_frame = int(state_start_frame(size, scenario, rng))
     if first_frame < 0:
         raise UsageError(
-            "a split starts a scenario before its first substep",
+            f"a split starts a scenario before its first substep: got {first_frame}, "
+            "expected 0 or more frames before frame 0; let start_frame return how "
+            "many frames are simulated before frame 0",
             where=f"{size.generator}.start_frame, scenario {scenario}",
-            expected="0 or more frames before frame 0",
-            got=first_frame,
-            fix="let start_frame return how many frames are simulated before frame 0",
         )
     return first_frame
 
@@ -124,38 +115,39 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             line = find_place_in_extension(error, size.generator)
             if line is None:
                 place = f"{place_of(size)}, scenario {scenario}"
-                raise _relocate(error, place) from error
+                raise WorkFailedError(error.text, where=place) from error
             raise WorkFailedError(
-                error.what,
+                f"{error.text}; mend this line of the module, or the parameters that "
+                f"it uses: {place_of(size)}",
                 where=f"{size.split} {size.name}, scenario {scenario}, {line}",
-                expected=error.expected,
-                got=error.got,
-                fix="mend this line of the module, or the parameters that it uses: "
-                f"{place_of(size)}",
             ) from error
 
     # From here on the author of the split is at fault, not the parameters.
     where = f"{size.generator}.initial_state"
     if not isinstance(state, InitialState):
         raise UsageError(
-            "a split drew no initial state",
+            f"a split drew no initial state: got {type(state).__name__}, expected an "
+            "InitialState; return an InitialState: docs/extending.md",
             where=where,
-            expected="an InitialState",
-            got=type(state).__name__,
-            fix="return an InitialState: docs/extending.md",
         )
-    _check_values(state, f"{where}, scenario {scenario}")
+    # The solver checks the arrays.
+    for name, value in state.parameters.items():
+        is_truth = isinstance(value, bool | np.bool_)
+        if find_name_fault(name) or is_truth or as_attribute(value) is None:
+            raise UsageError(
+                f"a parameter of an initial state cannot be stored: {value!r:.80}; "
+                f"expected {POSSIBLE_NAME}, and {STORABLE_VALUE}",
+                where=f"{where}, scenario {scenario}, parameter {name!r}",
+            )
     stated_start = start_frame(size, scenario)
     if state.start_frame != stated_start:
         raise UsageError(
-            "a split starts a scenario at another frame than it said",
+            "a split starts a scenario at another frame than it said: got "
+            f"{state.start_frame}, expected start_frame {stated_start}; let the split "
+            "have a function start_frame(size, scenario, rng) that returns the "
+            "start_frame of its initial state",
             where=f"{where}, scenario {scenario}",
-            expected=f"start_frame {stated_start}",
-            got=state.start_frame,
-            fix="let the split have a function start_frame(size, scenario, rng) that "
-            "returns the start_frame of its initial state",
         )
-    _refuse_hidden_constants(state, size, f"{where}, scenario {scenario}")
     return state
 
 
@@ -180,130 +172,6 @@ def file_parameters(
     return parameters
 
 
-def _check_values(state: InitialState, where: str) -> None:
-    """Refuse single values and drawn parameters that are of another kind than stated.
-
-    The solver checks the arrays.
-    """
-    # The solver bounds the area.
-    for name, least in (("area", -math.inf), ("viscosity", 0.0), ("friction", 0.0)):
-        value = getattr(state, name)
-        if not _is_finite_number(value) or value < least:
-            raise UsageError(
-                f"the {name} of an initial state is impossible",
-                where=where,
-                expected="a finite number, 0 or more",
-                got=describe_value(value),
-                fix=f"give InitialState such a number as {name}",
-            )
-
-    parameters: object = state.parameters
-    fix = "give InitialState parameters={'name': number or text}"
-    if not isinstance(parameters, Mapping):
-        raise UsageError(
-            "the parameters of an initial state are no mapping",
-            where=where,
-            expected="names with what was drawn, numbers or texts",
-            got=repr(parameters)[:80],
-            fix=fix,
-        )
-    for name, value in parameters.items():
-        fault = _find_name_fault(name)
-        if fault is not None:
-            raise UsageError(
-                f"a parameter of an initial state is named {describe_value(name)}",
-                where=where,
-                expected=POSSIBLE_NAME,
-                got=fault,
-                fix="rename the parameter",
-            )
-        is_truth = isinstance(value, bool | np.bool_)
-        if is_truth or as_attribute(value) is None:
-            raise UsageError(
-                "a parameter of an initial state cannot be stored",
-                where=f"{where}, parameter {name!r}",
-                expected=STORABLE_VALUE,
-                got=describe_value(value),
-                fix=fix,
-            )
-
-
-def _refuse_hidden_constants(state: InitialState, size: Size, where: str) -> None:
-    """Refuse a drawn parameter that files would state in place of a constant.
-
-    Our own splits are exempt. The recorded files of two of them state the draws of
-    ``wall`` and ``friction``.
-    """
-    if size.generator.split(".")[0] == "lagbench":
-        return
-    for name, value in state.parameters.items():
-        file_name = _FILE_NAMES.get(name, name)
-        if file_name in size.parameters:
-            raise UsageError(
-                "a parameter of an initial state has the name of a constant",
-                where=f"{where}, parameter {name!r}",
-                expected=f"a name that is no parameter in {place_of(size)}",
-                got=f"{describe_value(value)}, where {file_name} is "
-                f"{describe_value(size.value(file_name))}",
-                fix="rename the drawn parameter, or leave it out",
-            )
-
-
-def _find_name_fault(name: object) -> str | None:
-    """Return why no drawn parameter can have a name; None if one can.
-
-    The file's own ``start_frame`` is that of the initial state.
-    """
-    if not isinstance(name, str):
-        return "no text"
-    if name == "start_frame":
-        return "the name of an attribute that each file has"
-    return find_name_fault(name)
-
-
-def _is_finite_number(value: object) -> bool:
-    """Return whether a value is a number that a float can hold; True is none."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
-
-
-def _relocate(error: LagbenchError, where: str) -> LagbenchError:
-    """Return the same error with another place."""
-    return type(error)(
-        error.what,
-        where=where,
-        expected=error.expected,
-        got=error.got,
-        fix=error.fix,
-    )
-
-
-class _RecentStates:
-    """The initial states that this process drew last, oldest first."""
-
-    def __init__(self) -> None:
-        self._entries: list[tuple[Size, int, InitialState]] = []
-
-    def draw(self, size: Size, scenario: int) -> InitialState:
-        """Return the state of a scenario, from memory where it is among the last."""
-        for known_size, known_scenario, state in self._entries:
-            if known_scenario == scenario and known_size == size:
-                return state
-
-        state = draw_initial_state(size, scenario)
-        self._entries.append((size, scenario, state))
-        while sum(entry[0].particles for entry in self._entries) > KEPT_PARTICLES:
-            del self._entries[0]
-        return state
-
-
-_RECENT = _RecentStates()
-
-
 class ScenarioBatch:
     """Scenarios in a solver, and the frames at which they are due."""
 
@@ -315,7 +183,7 @@ class ScenarioBatch:
         self.job = job  # what to simulate
         self.size = size  # on which the solver runs
         # the scenarios before their first substep, in the order of the job
-        self.states = [_RECENT.draw(size, scenario) for scenario in job.scenarios]
+        self.states = [draw_initial_state(size, scenario) for scenario in job.scenarios]
         # which particles of each scenario its file holds
         self.recorded = []
         for scenario, state in zip(job.scenarios, self.states, strict=True):
@@ -339,8 +207,6 @@ class ScenarioBatch:
         # substeps between two reports
         self._stride = max(1, STRIDE // (size.particles * scenario_count))
         self._substep = 0  # substeps done so far
-        # (substep, offset) of every displacement
-        self._displacements: list[tuple[int, Singles]] = []
 
     def recordings(self) -> Iterator[tuple[int, int]]:
         """Yield (index in the batch, frame) whenever the solver stands at that
@@ -351,8 +217,7 @@ class ScenarioBatch:
         for index, state in enumerate(self.states):
             frame_count = self._frames[index]
             for frame in range(frame_count):
-                simulated_frames = state.start_frame + frame
-                substep = simulated_frames * interval
+                substep = (state.start_frame + frame) * interval
                 schedule.append((substep, index, frame))
         schedule.sort()
 
@@ -384,18 +249,13 @@ class ScenarioBatch:
         Shape [scenario, particle, axis].
         """
         self.solver.displace(offset)
-        self._displacements.append((self._substep, offset.copy()))
 
     def _advance_to(self, substep: int) -> None:
-        """Advance to a substep; a stride that fails is replayed to name its substep."""
+        """Advance to a substep."""
         while self._substep < substep:
             count = min(self._stride, substep - self._substep)
             with self._scenario_names():
-                try:
-                    self.solver.advance(count)
-                except WorkFailedError:
-                    self._replay(count)
-                    raise
+                self.solver.advance(count)
             self._substep += count
             running_count = self._update_extremes()
             self._report(count * running_count)
@@ -419,28 +279,6 @@ class ScenarioBatch:
             )
         return running_count
 
-    def _replay(self, count: int) -> None:
-        """Repeat everything up to here, then single substeps, to learn which one breaks
-        first.
-
-        Returns when none of them breaks: then the failure was not the simulation's.
-        """
-        self.solver.load(self.states)
-        done = 0
-        for substep, offset in self._displacements:
-            self._replay_to(substep, done)
-            done = substep
-            self.solver.displace(offset)
-        self._replay_to(self._substep, done)
-        for _ in range(count):
-            self.solver.advance(1)
-
-    def _replay_to(self, substep: int, done: int) -> None:
-        while done < substep:
-            step = min(self._stride, substep - done)
-            self.solver.advance(step)
-            done += step
-
     @contextmanager
     def _scenario_names(self) -> Iterator[None]:
         """Put a scenario's id into errors of the solver, which knows its index only."""
@@ -454,7 +292,9 @@ class ScenarioBatch:
             yield
         except (WorkFailedError, UsageError) as error:
             place = re.sub(r"scenario (\d+)", name_scenario, error.where or "")
-            raise _relocate(error, f"{size.split} {size.name}, {place}") from error
+            raise type(error)(
+                error.text, where=f"{size.split} {size.name}, {place}"
+            ) from error
 
 
 @functools.lru_cache(maxsize=1)

@@ -80,35 +80,25 @@ class BoxTables:
         # distance between the numbers of neighbours along each axis
         strides = []
         for axis in range(self.dimension):
-            next_axis = axis + 1
-            later_axes = self.shape[next_axis:]
+            later_axes = self.shape[axis + 1 :]
             stride = math.prod(later_axes)
             strides.append(stride)
         self.stride = tuple(strides)
         # the multi-index of each node, 0 and cells + 1 for ghosts, shape [node, axis]
-        indices = np.indices(self.shape)
-        by_axis = indices.reshape(self.dimension, -1)
-        self.index = by_axis.T
+        self.index = np.indices(self.shape).reshape(self.dimension, -1).T
         self._last = np.array(self.cells)
-        is_periodic = np.array(self.periodic)
-        self._is_walled = ~is_periodic
+        self._is_walled = ~np.array(self.periodic)
         # whether a node lies beyond an end of each axis, shape [node, axis]
-        is_below = self.index < 1
-        is_above = self.index > self._last
-        self._is_outside = is_below | is_above
+        self._is_outside = (self.index < 1) | (self.index > self._last)
         self._is_ghost = self._is_outside.any(axis=1)
         # numbers of the interior nodes, shape [interior]
-        is_interior = ~self._is_ghost
-        interior = np.flatnonzero(is_interior)
-        self.interior = interior.astype(np.int32)
+        self.interior = np.flatnonzero(~self._is_ghost).astype(np.int32)
         self.ghosts = self._ghosts()
         self.images = self._images()
 
     def _number(self, index: NDArray[np.integer]) -> Integers:
         """Return the numbers of nodes with these multi-indices."""
-        steps = index * self.stride
-        number = steps.sum(axis=-1)
-        return np.asarray(number, np.int32)
+        return np.asarray((index * self.stride).sum(axis=-1), np.int32)
 
     def _tangential_sign(self) -> int:
         """Return the sign with which a wall mirrors a tangential component."""
@@ -126,14 +116,11 @@ class BoxTables:
         return sign
 
     def _ghosts(self) -> Ghosts:
-        numbers = np.flatnonzero(self._is_ghost)
-        node = numbers.astype(np.int32)
+        node = np.flatnonzero(self._is_ghost).astype(np.int32)
         index = self.index[node]
         mirrored = np.clip(index, 1, self._last)
         # the node at the same place one period on
-        from_first = index - 1
-        wrapped_from_first = from_first % self._last
-        wrapped = wrapped_from_first + 1
+        wrapped = (index - 1) % self._last + 1
         source_index = np.where(self._is_walled, mirrored, wrapped)
         source = self._number(source_index)
 
@@ -148,33 +135,22 @@ class BoxTables:
             is_axis_across = is_across[:, axis]
             is_mirrored = is_axis_across[:, None]
             reflection = self._reflection(axis)
-            factor = np.where(is_mirrored, reflection, 1)
-            float_factor = factor.astype(np.float32)
-            sign *= float_factor
+            sign *= np.where(is_mirrored, reflection, 1).astype(np.float32)
 
         # Only one wall moves a ghost; where two meet, none does.
-        wall_count = is_across.sum(axis=1)
-        is_single = wall_count == 1
+        is_single = is_across.sum(axis=1) == 1
         normal = np.argmax(is_across, axis=1)
         ghosts = np.arange(ghost_count)
         index_along_normal = index[ghosts, normal]
-        is_upper = index_along_normal > 1
-        lower_wall = 2 * normal
-        nearest_wall = lower_wall + is_upper
-        wall = np.where(is_single, nearest_wall, 0)
+        wall = np.where(is_single, 2 * normal + (index_along_normal > 1), 0)
 
         axes = np.arange(dimension)
         ghost_normal = normal[:, None]
         has_one_wall = is_single[:, None]
-        is_along_wall = axes != ghost_normal
-        is_tangential = has_one_wall & is_along_wall
+        is_tangential = has_one_wall & (axes != ghost_normal)
         # In the last cells before a wall that the motion runs into it is halved.
-        is_first = index == 1
-        is_last = index == self._last
-        is_end = is_first | is_last
-        is_before_wall = is_end & self._is_walled
-        share = np.where(is_before_wall, 1.0, 2.0)
-        drive = share * is_tangential
+        is_before_wall = ((index == 1) | (index == self._last)) & self._is_walled
+        drive = np.where(is_before_wall, 1.0, 2.0) * is_tangential
         wall = wall.astype(np.int32)
         drive = drive.astype(np.float32)
         return Ghosts(
@@ -187,9 +163,7 @@ class BoxTables:
 
     def _images(self) -> Images:
         interior_index = self.index[self.interior]
-        is_first = interior_index == 1
-        is_last = interior_index == self._last
-        is_end = is_first | is_last
+        is_end = (interior_index == 1) | (interior_index == self._last)
         has_images = is_end.any(axis=1)
         node = self.interior[has_images]
         index = interior_index[has_images]
@@ -199,11 +173,8 @@ class BoxTables:
         # one beyond the other end along a periodic axis
         is_below = np.where(self._is_walled, is_low, is_high)
         dimension = self.dimension
-        beyond_last = self._last + 1
-        beyond = np.where(is_below, 0, beyond_last)
-        axes = np.arange(dimension)
-        low_wall = 2 * axes
-        wall_across = low_wall + is_high
+        beyond = np.where(is_below, 0, self._last + 1)
+        wall_across = 2 * np.arange(dimension) + is_high
 
         # whether an image crosses each axis, one array per image
         subsets = []
@@ -222,19 +193,14 @@ class BoxTables:
         wall = np.full(wall_shape, -1, np.int32)
 
         for image, subset in enumerate(subsets):
-            is_kept = ~subset
-            may_cross = is_low | is_high | is_kept
-            exists = may_cross.all(axis=1)
+            exists = (is_low | is_high | ~subset).all(axis=1)
             ghost_index = np.where(subset, beyond, index)
             number = self._number(ghost_index)
-            image_ghost = np.where(exists, number, -1)
-            ghost[:, image] = image_ghost
+            ghost[:, image] = np.where(exists, number, -1)
 
             walled_subset = subset & self._is_walled
             image_exists = exists[:, None]
-            crosses_wall = image_exists & walled_subset
-            image_wall = np.where(crosses_wall, wall_across, -1)
-            wall[:, image] = image_wall
+            wall[:, image] = np.where(image_exists & walled_subset, wall_across, -1)
 
             walled_axes = np.flatnonzero(walled_subset)
             for axis in walled_axes.tolist():
@@ -259,9 +225,8 @@ class BoxTables:
         drive = np.zeros(shape, np.float32)
         wall = ghosts.wall
         ghost_wall_velocity = wall_velocity[:, wall]
-        velocity_gain = ghosts.drive * ghost_wall_velocity
         dimension = self.dimension
-        drive[..., :dimension] = velocity_gain
+        drive[..., :dimension] = ghosts.drive * ghost_wall_velocity
         return drive
 
     def image_drag(self, wall_velocity: Singles) -> Singles:
@@ -281,8 +246,7 @@ class BoxTables:
         shape = (scenario_count, *image_shape, LANES)
         drag = np.zeros(shape, np.float32)
         zero = np.float32(0.0)
-        two = np.float32(2.0)
-        twice_wall_velocity = two * wall_velocity
+        twice_wall_velocity = np.float32(2.0) * wall_velocity
         dimension = self.dimension
         axes = np.arange(dimension)
         for normal in range(dimension):
@@ -292,7 +256,6 @@ class BoxTables:
             some_wall = np.maximum(wall, 0)
             momentum = twice_wall_velocity[:, some_wall]
             is_image_across = is_crossed[..., None]
-            counts = is_image_across & is_tangential
-            momentum = np.where(counts, momentum, zero)
+            momentum = np.where(is_image_across & is_tangential, momentum, zero)
             drag[..., :dimension] += momentum
         return drag

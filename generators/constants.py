@@ -9,8 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, Field, fields
-from difflib import get_close_matches
+from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from lagbench.data.box import Box
@@ -103,6 +102,11 @@ PARAMETER_ERRORS = (TypeError, ValueError, ArithmeticError, LookupError)
 """What a split of ours raises over parameters that it cannot use."""
 
 
+def place_of(size: Size) -> str:
+    """Return where a size is described, for messages."""
+    return f"{size.file}, splits.{size.split}, size {size.name}"
+
+
 def check_constants(
     kind: ParametersType, values: Mapping[str, object], size: Size
 ) -> None:
@@ -112,77 +116,35 @@ def check_constants(
         UnreadableFileError: a constant is missing or has an impossible value.
     """
     for field in fields(kind):
-        if field.name in values:
-            _check_value(field, values, size)
-        elif field.default is MISSING:
-            raise _missing_parameter(field.name, kind, size)
-    if values.get("fringe_rate", 0.0):
-        if "fringe_length" not in values:
-            raise _missing_parameter("fringe_length", kind, size)
-        length = values["fringe_length"]
-        box_length = float(size.box.lengths[0])
-        limit = Limit(low=0.0, high=box_length, open_low=True)
-        if not limit.holds(length):
-            raise _impossible_value("fringe_length", length, str(limit), size)
-
-
-def place_of(size: Size) -> str:
-    """Return where a size is described, for messages."""
-    return f"{size.file}, splits.{size.split}, size {size.name}"
-
-
-def _missing_parameter(
-    name: str, kind: ParametersType, size: Size
-) -> UnreadableFileError:
-    """Return the error for a missing parameter; it suggests names that are like it."""
-    constant_names = {field.name for field in fields(kind)}
-    unused_names = [other for other in size.parameters if other not in constant_names]
-    similar_names = get_close_matches(name, unused_names, n=3)
-    fix = f"declare {name} under parameters of the split"
-    if similar_names:
-        fix = f"did you mean {similar_names[0]!r}?"
-    return UnreadableFileError(
-        "a parameter is missing",
-        where=f"{place_of(size)}, parameter {name}",
-        expected=name,
-        got=", ".join(similar_names) or "no name like it",
-        fix=fix,
-    )
-
-
-def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) -> None:
-    """Refuse a constant with an impossible value."""
-    value = values[field.name]
-    if isinstance(value, Box):  # the registry has checked it
-        return
-    limit = LIMITS.get(field.name, Limit())
-    if field.type == "bool":
-        is_possible = isinstance(value, bool)
-        expected = "true or false"
-    else:
+        name = field.name
+        where = f"{place_of(size)}, parameter {name}"
+        needs_length = name == "fringe_length" and values.get("fringe_rate")
+        if name not in values:
+            if field.default is MISSING or needs_length:
+                raise UnreadableFileError(
+                    "a parameter is missing; declare it under parameters of the split",
+                    where=where,
+                )
+            continue
+        value = values[name]
+        limit = LIMITS.get(name, Limit())
+        if name == "wall" and limit.holds(value):
+            # Between the walls lie four cells at least.
+            high = (int(str(values["grid"])) - 4) // 2
+            limit = Limit(low=0, high=high, whole=True)
+        elif needs_length:
+            high_end = float(size.box.lengths[0])
+            limit = Limit(low=0.0, high=high_end, open_low=True)
         is_possible = limit.holds(value)
-        expected = str(limit)
-    if field.name == "wall" and is_possible:
-        # Between the walls lie four cells at least.
-        high = (int(str(values["grid"])) - 4) // 2
-        limit = Limit(low=0, high=high, whole=True)
-        is_possible = limit.holds(value)
-        expected = str(limit)
-    if not is_possible:
-        raise _impossible_value(field.name, value, expected, size)
-
-
-def _impossible_value(
-    name: str, value: object, expected: str, size: Size
-) -> UnreadableFileError:
-    """Return the error for a parameter that a solver cannot use."""
-    return UnreadableFileError(
-        "a parameter has no possible value",
-        where=f"{place_of(size)}, parameter {name}",
-        expected=expected,
-        got=repr(value),
-        fix="correct it in the file of the split",
-    )
+        if field.type == "bool":
+            is_possible = isinstance(value, bool)
+        # The registry has checked the box.
+        if not is_possible and not isinstance(value, Box):
+            raise UnreadableFileError(
+                f"{value!r} is no possible value, expected {limit}; correct it in the "
+                "file of the split",
+                where=where,
+            )
 
 
 @contextmanager
@@ -202,11 +164,8 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
     except UsageError as error:
         places = [place_of(size), find_place_in_extension(error, size.generator)]
         raise UnreadableFileError(
-            error.what,
+            error.text,
             where=", ".join(place for place in places if place),
-            expected=error.expected,
-            got=error.got,
-            fix=error.fix,
         ) from error
     except (LagbenchError, MemoryError):
         raise
@@ -215,33 +174,21 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
         place = find_place_in_extension(error, size.generator)
         if place is not None:
             raise WorkFailedError(
-                f"{work} failed in the module of split {size.split!r}",
-                where=place,
-                expected="no exception",
-                got=f"{type(error).__name__}: {text_of(error)}",
-                fix="mend this line of the module, or the parameters that it uses: "
+                f"{work} failed in the module of split {size.split!r}: got "
+                f"{type(error).__name__}: {text_of(error)}, expected no exception; "
+                "mend this line of the module, or the parameters that it uses: "
                 f"{place_of(size)}",
+                where=place,
             ) from error
         if not isinstance(error, PARAMETER_ERRORS):
             raise
         raise UnreadableFileError(
-            f"{work} failed with these parameters",
+            f"{work} failed with these parameters: got {type(error).__name__}: "
+            f"{error}, expected parameters that {size.generator} "
+            "can use; compare the parameters with those in the datasets.yaml of "
+            "lagbench",
             where=place_of(size),
-            expected=f"parameters that {size.generator} can use",
-            got=f"{type(error).__name__}: {error}{_list_texts(size)}",
-            fix="compare the parameters with those in the datasets.yaml of lagbench",
         ) from error
-
-
-def _list_texts(size: Size) -> str:
-    """Return the end of a sentence that lists the parameters that are no numbers."""
-    texts = []
-    for name, parameter in size.parameters.items():
-        if isinstance(parameter.value, bool | str):
-            texts.append(f"{name} = {parameter.value!r}")
-    if not texts:
-        return ""
-    return f"; parameters that are no numbers: {', '.join(texts)}"
 
 
 Kind = TypeVar("Kind", FreeSurfaceParameters, FullBoxParameters)
@@ -303,21 +250,19 @@ def split_module(size: Size) -> SplitGenerator:
     # A stranger's module may raise anything, or end the program.
     except (Exception, SystemExit) as error:
         raise UsageError(
-            f"the generator of split {size.split!r} cannot be imported",
+            f"the generator of split {size.split!r} cannot be imported: got "
+            f"{describe_exception(error, size.generator)}, expected a module that can "
+            "be imported; mend the module, or correct the key generator of the split",
             where=size.generator,
-            expected="a module that can be imported",
-            got=describe_exception(error, size.generator),
-            fix="mend the module, or correct the key generator of the split",
         ) from error
     needed = ("solver_parameters", "initial_state")
     missing = [name for name in needed if not hasattr(module, name)]
     if missing:
         raise UsageError(
-            f"a generator lacks {' and '.join(missing)}",
+            f"a generator lacks {' and '.join(missing)}: got a module without these "
+            f"functions, expected {' and '.join(needed)}; add the functions: "
+            "docs/extending.md has the contract of a split",
             where=size.generator,
-            expected=" and ".join(needed),
-            got="a module without these functions",
-            fix="add the functions: docs/extending.md has the contract of a split",
         )
     return cast("SplitGenerator", module)
 
@@ -335,11 +280,10 @@ def solver_constants(size: Size) -> SolverParameters:
     if type(parameters) not in IMPLEMENTATIONS:
         type_names = [known_type.__name__ for known_type in IMPLEMENTATIONS]
         raise UsageError(
-            "a split returned no constants of a solver",
+            "a split returned no constants of a solver: got "
+            f"{type(parameters).__name__}, expected an object of one of these types: "
+            f"{', '.join(type_names)}; return constants(FreeSurfaceParameters, size), "
+            "or those of another of these types",
             where=f"{size.generator}.solver_parameters",
-            expected=f"an object of one of these types: {', '.join(type_names)}",
-            got=type(parameters).__name__,
-            fix="return constants(FreeSurfaceParameters, size), or those of another of "
-            "these types",
         )
     return parameters

@@ -42,12 +42,8 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
     (16.0, 16.0)
     """
     lateral = 1.0 + poisson
-    twice_poisson = 2.0 * poisson
-    incompressibility = 1.0 - twice_poisson
-    twice_lateral = 2.0 * lateral
-    divisor = lateral * incompressibility
-    mu = young / twice_lateral
-    la = young * poisson / divisor
+    mu = young / (2.0 * lateral)
+    la = young * poisson / (lateral * (1.0 - 2.0 * poisson))
     return mu, la
 
 
@@ -57,8 +53,7 @@ def larger(a: f32, b: f32) -> f32:
 
     This is one instruction, unlike max.
     """
-    is_larger = a > b
-    return ti.select(is_larger, a, b)
+    return ti.select(a > b, a, b)
 
 
 @ti.func
@@ -76,15 +71,9 @@ def exponential(z: f32) -> f32:
     t = z * 0.0625
     square = t * t
     # the polynomial in three groups: t^4 to t^6, t^2 and t^3, 1 and t
-    fifth = t * (1.0 / 120.0)
-    sixth = square * (1.0 / 720.0)
-    high = 1.0 / 24.0 + fifth + sixth
-    third = t * (1.0 / 6.0)
-    mid = 0.5 + third
-    low = 1.0 + t
-    from_fourth = square * high
-    from_second = mid + from_fourth
-    e = low + square * from_second
+    high = 1.0 / 24.0 + t * (1.0 / 120.0) + square * (1.0 / 720.0)
+    mid = 0.5 + t * (1.0 / 6.0)
+    e = 1.0 + t + square * (mid + square * high)
     for _ in ti.static(range(4)):
         e = e * e
     return e
@@ -112,8 +101,7 @@ def rotation(f: mat2) -> vec3:
     yy = f[1, 1]
     e = 0.5 * (xx + yy)
     g = 0.5 * (yx - xy)
-    q_square = e * e + g * g
-    q = ti.sqrt(q_square)
+    q = ti.sqrt(e * e + g * g)
     cosine = 1.0
     sine = 0.0
     if q > _STRETCH_EPSILON:
@@ -168,22 +156,14 @@ def corotated_stress(f: mat2, mu: f32, la: f32) -> mat2:
     cosine, sine, q = rotation(f)
     h, k = shear_parts(f)
     r_square = h * h + k * k
-    q_square = q * q
-    jacobian = q_square - r_square
-    volume_change = jacobian - 1.0
-    volumetric = la * volume_change * jacobian
+    jacobian = q * q - r_square
+    volumetric = la * (jacobian - 1.0) * jacobian
 
     double_mu = 2.0 * mu
-    mean_strain = q - 1.0
-    isotropic = q * mean_strain + r_square
-    shear_mean = double_mu * isotropic
-    mean = shear_mean + volumetric
-    double_q = 2.0 * q
-    w_factor = double_mu * (double_q - 1.0)
-    w_normal = cosine * h - sine * k
-    w_shear = cosine * k + sine * h
-    normal = w_factor * w_normal
-    shear = w_factor * w_shear
+    mean = double_mu * (q * (q - 1.0) + r_square) + volumetric
+    w_factor = double_mu * (2.0 * q - 1.0)
+    normal = w_factor * (cosine * h - sine * k)
+    shear = w_factor * (cosine * k + sine * h)
     normal_x = mean + normal
     normal_y = mean - normal
     return mat2([normal_x, shear], [shear, normal_y])
@@ -196,8 +176,7 @@ def hardening(plastic: f32, exponent: f32, low: f32, high: f32) -> f32:
     Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent``
     is xi [1]. The caps lie within exp(-+EXPONENT_MAX).
     """
-    compaction = 1.0 - plastic
-    z = exponent * compaction
+    z = exponent * (1.0 - plastic)
     z = bounded(z, -EXPONENT_MAX, EXPONENT_MAX)
     factor = exponential(z)
     return bounded(factor, low, high)
@@ -216,16 +195,13 @@ def plastic_return(f: mat2, low: f32, high: f32) -> Value:
     """
     cosine, sine, q = rotation(f)
     h, k = shear_parts(f)
-    r_square = h * h + k * k
-    r = ti.sqrt(r_square)
+    r = ti.sqrt(h * h + k * k)
     trial_high = q + r
     trial_low = q - r
     new_high = bounded(trial_high, low, high)
     new_low = bounded(trial_low, low, high)
-    new_sum = new_high + new_low
-    new_difference = new_high - new_low
-    new_q = 0.5 * new_sum
-    new_r = 0.5 * new_difference
+    new_q = 0.5 * (new_high + new_low)
+    new_r = 0.5 * (new_high - new_low)
 
     r_ratio = 0.0
     if r > _SHEAR_EPSILON:
@@ -242,7 +218,5 @@ def plastic_return(f: mat2, low: f32, high: f32) -> Value:
 
     old_high = larger(trial_high, STRETCH_MIN)
     old_low = larger(trial_low, STRETCH_MIN)
-    old_area = old_high * old_low
-    new_area = new_high * new_low
-    growth = old_area / new_area
+    growth = old_high * old_low / (new_high * new_low)
     return elastic, growth

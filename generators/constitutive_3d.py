@@ -74,11 +74,7 @@ def dot(a: Template, b: Template) -> Value:
     """Return the dot product of two rows."""
     a_x, a_y, a_z = a
     b_x, b_y, b_z = b
-    along_x = a_x * b_x
-    along_y = a_y * b_y
-    along_z = a_z * b_z
-    along_xy = along_x + along_y
-    return along_xy + along_z
+    return a_x * b_x + a_y * b_y + a_z * b_z
 
 
 @ti.func
@@ -149,16 +145,10 @@ def principal_minors(b: Template) -> Value:
     xx, yy, zz, yz, xz, xy = b
     # of each minor, the products along its main and along its other diagonal
     main_x = yy * zz
-    main_y = xx * zz
     main_z = xx * yy
     other_x = yz * yz
     other_y = xz * xz
-    other_z = xy * xy
-    minor_x = main_x - other_x
-    minor_y = main_y - other_y
-    minor_z = main_z - other_z
-    minors_zx = minor_z + minor_x
-    return minors_zx + minor_y
+    return main_z - xy * xy + (main_x - other_x) + (xx * zz - other_y)
 
 
 @ti.func
@@ -169,19 +159,10 @@ def determinant(rows: Template) -> Value:
     yx, yy, yz = y_row
     zx, zy, zz = z_row
     # of each minor, the products along its main and along its other diagonal
-    main_x = yy * zz
-    main_y = yx * zz
-    main_z = yx * zy
-    other_x = yz * zy
-    other_y = yz * zx
     other_z = yy * zx
-    minor_x = main_x - other_x
-    minor_y = main_y - other_y
-    minor_z = main_z - other_z
-    x_term = xx * minor_x
-    y_term = xy * minor_y
-    z_term = xz * minor_z
-    return (x_term - y_term) + z_term
+    minor_x = yy * zz - yz * zy
+    minor_y = yx * zz - yz * zx
+    return xx * minor_x - xy * minor_y + xz * (yx * zy - other_z)
 
 
 @ti.func
@@ -200,20 +181,14 @@ def stretch_sum(b: Template, jacobian: Value) -> Value:
     minors = principal_minors(b)
     linear_factor = 8.0 * jacobian
     constant_term = 4.0 * minors
-    triple_trace = 3.0 * b_trace
-    total = ti.sqrt(triple_trace)
+    total = ti.sqrt(3.0 * b_trace)
     for _ in ti.static(range(_NEWTON_STEPS)):
-        total_square = total * total
-        double_pairs = total_square - b_trace
+        double_pairs = total * total - b_trace
         leading_term = double_pairs * double_pairs
-        linear_term = linear_factor * total
-        quartic = (leading_term - linear_term) - constant_term
-        fourfold_total = 4.0 * total
-        leading_slope = fourfold_total * double_pairs
-        derivative = leading_slope - linear_factor
+        quartic = leading_term - linear_factor * total - constant_term
+        derivative = 4.0 * total * double_pairs - linear_factor
         divisor = larger(derivative, _EPSILON)
-        step = quartic / divisor
-        total = total - step
+        total = total - quartic / divisor
     return total
 
 
@@ -226,11 +201,8 @@ def left_stretch(b: Template, jacobian: Value) -> Value:
     """
     b_trace = trace(b)
     total = stretch_sum(b, jacobian)
-    total_square = total * total
-    double_pairs = total_square - b_trace
-    pairs = 0.5 * double_pairs
-    pairs_total = pairs * total
-    sum_product = pairs_total - jacobian
+    pairs = 0.5 * (total * total - b_trace)
+    sum_product = pairs * total - jacobian
     divisor = larger(sum_product, _EPSILON)
     inverse = 1.0 / divisor
     # (pairs + tr B) B - B^2 + total J I
@@ -251,9 +223,7 @@ def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
     """
     b = times_transposed(rows)
     jacobian = determinant(rows)
-    volume_change = jacobian - 1.0
-    pressure = la * volume_change
-    volumetric = pressure * jacobian
+    volumetric = la * (jacobian - 1.0) * jacobian
     v = left_stretch(b, jacobian)
     strain = minus(b, v)
     double_mu = 2.0 * mu
@@ -287,12 +257,9 @@ def add_rate(row: Template, rate: Template, dt: f32) -> Value:
     """Return row + dt rate; the rate is in [1/s]."""
     old_x, old_y, old_z = row
     x_rate, y_rate, z_rate = rate
-    x_step = dt * x_rate
-    y_step = dt * y_rate
-    z_step = dt * z_rate
-    x = old_x + x_step
-    y = old_y + y_step
-    z = old_z + z_step
+    x = old_x + dt * x_rate
+    y = old_y + dt * y_rate
+    z = old_z + dt * z_rate
     return [x, y, z]
 
 
@@ -311,16 +278,10 @@ def rotation_tangent(difference: Value, double_entry: Value) -> Value:
         difference: d.
         double_entry: 2 b_pq.
     """
-    difference_square = difference * difference
-    entry_square = double_entry * double_entry
-    discriminant = difference_square + entry_square
-    root = ti.sqrt(discriminant)
-    is_negative = difference < 0.0
-    signed_root = ti.select(is_negative, -root, root)
-    divisor = difference + signed_root
+    root = ti.sqrt(difference * difference + double_entry * double_entry)
+    divisor = difference + ti.select(difference < 0.0, -root, root)
     is_diagonal = divisor == 0.0
-    safe_divisor = ti.select(is_diagonal, 1.0, divisor)
-    tangent = double_entry / safe_divisor
+    tangent = double_entry / ti.select(is_diagonal, 1.0, divisor)
     return ti.select(is_diagonal, 0.0, tangent)
 
 
@@ -329,12 +290,8 @@ def rotated(
     p_component: Value, q_component: Value, cosine: Value, sine: Value
 ) -> Value:
     """Return two components after the axes p and q were rotated."""
-    p_from_p = cosine * p_component
-    p_from_q = sine * q_component
-    q_from_p = sine * p_component
-    q_from_q = cosine * q_component
-    new_p_component = p_from_p - p_from_q
-    new_q_component = q_from_p + q_from_q
+    new_p_component = cosine * p_component - sine * q_component
+    new_q_component = sine * p_component + cosine * q_component
     return new_p_component, new_q_component
 
 
@@ -364,10 +321,7 @@ def principal_axes(b: Template) -> Value:
             difference = entry_qq - entry_pp
             double_entry = 2.0 * entry_pq
             tangent = rotation_tangent(difference, double_entry)
-            tangent_square = tangent * tangent
-            secant_square = tangent_square + 1.0
-            secant = ti.sqrt(secant_square)
-            cosine = 1.0 / secant
+            cosine = 1.0 / ti.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
 
             shift = tangent * entry_pq
@@ -466,8 +420,7 @@ def plastic_return(rows: Template, low: f32, high: f32) -> Value:
     ratio_1, growth_1 = clamp_ratios(square_1, low, high)
     ratio_2, growth_2 = clamp_ratios(square_2, low, high)
     ratio_3, growth_3 = clamp_ratios(square_3, low, high)
-    growth_12 = growth_1 * growth_2
-    growth = growth_12 * growth_3
+    growth = growth_1 * growth_2 * growth_3
     ratios = [ratio_1, ratio_2, ratio_3]
     q_rows = transposed(axes)
     f_columns = transposed(rows)

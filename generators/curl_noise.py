@@ -64,11 +64,8 @@ def stream_function(
 
     The velocity is u = psi.y and v = -psi.x.
     """
-    node_count = len(lattice)
-    last_node = node_count - 1
-    cell_count = float(last_node)
     width = high - low
-    per_length = cell_count / width
+    per_length = float(len(lattice) - 1) / width
     x, y = coordinates(position)
     minus_x = x.scale(-1.0)
     minus_y = y.scale(-1.0)
@@ -116,8 +113,7 @@ def flow(psi: Jet) -> tuple[Array, Array]:
 
 def _root_mean_square(values: Array) -> float:
     square_sum = _sum_of_squares(values)
-    mean_square = square_sum / values.size
-    return math.sqrt(mean_square)
+    return math.sqrt(square_sum / values.size)
 
 
 def _sum_of_squares(values: Array) -> float:
@@ -136,8 +132,7 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     """
     low, high = size.bounds[0]
     parameters = solver_parameters(size)
-    indices = np.arange(parameters.cells[0])
-    node = (parameters.origin[0] + 1.0 + indices) / size.grid
+    node = (parameters.origin[0] + 1.0 + np.arange(parameters.cells[0])) / size.grid
     node_count = len(node)
     grid_x, grid_y = np.meshgrid(node, node, indexing="ij")
     x = grid_x.ravel()
@@ -146,10 +141,8 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
 
     psi = stream_function(points, lattice, low=low, high=high, scale=scale)
     grid_shape = (node_count, node_count)
-    psi_x = psi.x.reshape(grid_shape)
-    psi_y = psi.y.reshape(grid_shape)
-    u = psi_y
-    v = -psi_x
+    u = psi.y.reshape(grid_shape)
+    v = -psi.x.reshape(grid_shape)
 
     # neighbours of the inner nodes
     inner = slice(1, -1)
@@ -160,12 +153,8 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     north = (inner, after)
     south = (inner, before)
     per_difference = 0.5 * size.grid  # slope for a difference over two cells
-    u_rise = u[east] - u[west]
-    v_rise = v[east] - v[west]
-    net_outflow = u_rise + v[north] - v[south]
-    circulation = v_rise - u[north] + u[south]
-    divergence = net_outflow * per_difference
-    vorticity = circulation * per_difference
+    divergence = (u[east] - u[west] + v[north] - v[south]) * per_difference
+    vorticity = (v[east] - v[west] - u[north] + u[south]) * per_difference
     divergence_rms = _root_mean_square(divergence)
     vorticity_rms = _root_mean_square(vorticity)
     return divergence_rms, vorticity_rms
@@ -186,8 +175,7 @@ def _frequency(size: Size, scenario: int) -> int:
     if number is None:
         frequency_count = int(size.value("frequency_count"))
         least_frequency = int(size.value("frequency_min"))
-        turn = scenario % frequency_count
-        return least_frequency + turn
+        return least_frequency + scenario % frequency_count
     if number % 2 == 0:
         return int(size.value("frequency_shift_low"))
     return int(size.value("frequency_shift_high"))
@@ -211,11 +199,11 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     place_count = columns * rows
     if place_count != size.particles:
         raise UsageError(
-            "the lattice does not hold the particles",
+            f"the lattice does not hold the particles: got {columns} * {rows} = "
+            f"{place_count}, expected lattice_x * lattice_y = particles = "
+            f"{size.particles}; correct the number of particles in the file of the "
+            "split",
             where=f"datasets.yaml, {size.split} {size.name}",
-            expected=f"lattice_x * lattice_y = particles = {size.particles}",
-            got=f"{columns} * {rows} = {place_count}",
-            fix="correct the number of particles in the file of the split",
         )
     position = fill_grid(
         rng,
@@ -234,8 +222,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     velocity, affine = flow(psi)
     divergence, vorticity = _grid_rates(lattice, size, scale)
     square_sum = _sum_of_squares(velocity)
-    half_sum = 0.5 * square_sum
-    energy = half_sum / size.particles
+    energy = 0.5 * square_sum / size.particles
     width = high - low
     return InitialState(
         position=position,

@@ -81,10 +81,7 @@ def ring_potential(
     x = coordinate(offset[:, 0], 0, 3)
     y = coordinate(offset[:, 1], 1, 3)
     z = coordinate(offset[:, 2], 2, 3)
-    x_square = x * x
-    y_square = y * y
-    z_square = z * z
-    square = x_square + y_square + z_square
+    square = x * x + y * y + z * z
     radius_square = radius * radius
     minus_q = square.scale(-1.0 / radius_square)
     one_minus_q = minus_q.shift(1.0)

@@ -78,8 +78,7 @@ def lattice_counts(size: Size) -> tuple[int, int]:
 def lattice_places(size: Size) -> Array:
     """Return the places of the lattice [length], shape [place, 2]."""
     indices = np.indices(lattice_counts(size))
-    indices_by_axis = indices.reshape(2, -1)
-    cell = indices_by_axis.T
+    cell = indices.reshape(2, -1).T
     middle = cell + 0.5
     from_corner = middle / size.value("lattice")
     corner = np.array(size.box.low)
@@ -107,8 +106,7 @@ def middle_of_disc(size: Size, steps: int) -> tuple[float, float]:
 def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
     """Draw the centre of the fixed disc [length]; only its y differs by scenario."""
     most_steps = int(size.value("offset_max"))
-    twice_most_steps = 2 * most_steps
-    place_count = twice_most_steps + 1
+    place_count = 2 * most_steps + 1
     place = choice(rng, place_count)
     return middle_of_disc(size, place - most_steps)
 
@@ -116,8 +114,7 @@ def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
 def _square(vectors: Array) -> Array:
     """Return the squared length of vectors in the plane, shape [vector]."""
     x, y = vectors.T
-    square = x * x + y * y
-    return np.asarray(square)
+    return np.asarray(x * x + y * y)
 
 
 def _pairs(x: Array, y: Array) -> Array:
@@ -130,9 +127,7 @@ def moved_out(position: Array, centre: Array, radius: float) -> Array:
     way = position - centre
     square = _square(way)
     distance = np.sqrt(square)
-    is_in = distance < radius
-    stretch_to_rim = radius / distance
-    stretch = np.where(is_in, stretch_to_rim, 1.0)
+    stretch = np.where(distance < radius, radius / distance, 1.0)
     stretched_way = stretch[:, None] * way
     moved = centre + stretched_way
     return quantise(moved)
@@ -161,14 +156,10 @@ def potential_flow(
     way = position - centre
     x, y = way.T
     square = _square(way)
-    fourth_power = square * square
-    moment = speed * radius * radius
-    dipole = moment / fourth_power
+    dipole = speed * radius * radius / (square * square)
     x_square = x * x
     y_square = y * y
-    difference = x_square - y_square
-    loss = dipole * difference
-    u = speed - loss
+    u = speed - dipole * (x_square - y_square)
     v = -2.0 * dipole * x * y
     velocity = _pairs(u, v)
 
@@ -202,12 +193,10 @@ def eddy(
         radius: R [length].
         speed: U', positive for a turn against the clock [length/s].
     """
-    from_centre = position - centre
-    way = from_centre / radius
+    way = (position - centre) / radius
     square = _square(way)
-    is_inside_eddy = square < 1.0
     rest = 1.0 - square
-    rest = np.where(is_inside_eddy, rest, 0.0)
+    rest = np.where(square < 1.0, rest, 0.0)
     rate = 3.5 * speed * rest * rest
     x, y = way.T
     u = -rate * y
@@ -261,8 +250,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     diameters_behind = uniform(rng, 2.0, 2.5)
     diameters_above = uniform(rng, -0.5, 0.5)
     diameters = np.array([diameters_behind, diameters_above])
-    way = diameter * diameters
-    eddy_centre = centre + way
+    eddy_centre = centre + diameter * diameters
     radius_share = uniform(rng, 0.75, 1.0)
     speed_share = uniform(rng, 0.5, 1.0)
     eddy_radius = radius_share * diameter
@@ -270,8 +258,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     if choice(rng, 2):
         eddy_speed = -eddy_speed
 
-    is_fluid = ~is_solid
-    fluid = position[is_fluid]
+    fluid = position[~is_solid]
     fluid = moved_out(fluid, centre, radius)
     velocity, affine = eddy(fluid, eddy_centre, radius=eddy_radius, speed=eddy_speed)
     past, past_affine = potential_flow(fluid, centre, radius=radius, speed=speed)
@@ -317,9 +304,8 @@ def _check_counts(size: Size, solid_count: int, lattice_count: int) -> None:
     stated = (size.particles, stated_solid_count)
     if stated != expected:
         raise UsageError(
-            "the lattice does not hold the particles",
+            f"the lattice does not hold the particles: got {stated}, expected "
+            f"particles, obstacle_particles = {expected}; correct the number of "
+            "particles in the file of the split",
             where=f"datasets.yaml, {size.split} {size.name}",
-            expected=f"particles, obstacle_particles = {expected}",
-            got=stated,
-            fix="correct the number of particles in the file of the split",
         )

@@ -49,11 +49,11 @@ def particles_per_side(size: Size) -> int:
     side = int(size.value("lattice"))
     if side**dimension != size.particles:
         raise UsageError(
-            "the lattice does not hold the particles",
+            f"the lattice does not hold the particles: got {side**dimension}, "
+            f"expected lattice to the power {dimension} = particles = "
+            f"{size.particles}; correct the number of particles in the file of the "
+            "split",
             where=f"datasets.yaml, {size.split} {size.name}",
-            expected=f"lattice to the power {dimension} = particles = {size.particles}",
-            got=side**dimension,
-            fix="correct the number of particles in the file of the split",
         )
     return side
 

@@ -112,15 +112,12 @@ def quantise(values: ArrayLike) -> Array:
     magnitude = np.abs(exact)
     if not np.all(magnitude < _LARGEST):
         raise WorkFailedError(
-            "a drawn value has no exact float32 form",
+            f"a drawn value has no exact float32 form: got {float(np.max(magnitude))}, "
+            f"expected finite, magnitude below {_LARGEST}; check the ranges and scales "
+            "in the file of the split",
             where="a draw",
-            expected=f"finite, magnitude below {_LARGEST}",
-            got=float(np.max(magnitude)),
-            fix="check the ranges and scales in the file of the split",
         )
-    quanta = exact / QUANTUM
-    whole_quanta = np.rint(quanta)
-    rounded = whole_quanta * QUANTUM
+    rounded = np.rint(exact / QUANTUM) * QUANTUM
     # rint keeps the sign of -0.0, the addition of zero does not
     return np.asarray(rounded + 0.0, dtype=np.float64)
 
@@ -175,8 +172,7 @@ def _draw_unit(rng: RandomSource) -> float:
 def uniform(rng: RandomSource, low: float, high: float) -> float:
     """Draw uniformly from [low, high), rounded to a multiple of 2^-20."""
     share = _draw_unit(rng)
-    width = high - low
-    value = low + width * share
+    value = low + (high - low) * share
     return float(quantise(value))
 
 
@@ -187,11 +183,9 @@ def log_uniform(rng: RandomSource, low: float, high: float) -> float:
     """
     if not 0.0 < low <= high:
         raise WorkFailedError(
-            "a log-uniform range is empty",
+            f"a log-uniform range is empty: got {(low, high)}, expected 0 < low <= "
+            "high; check the ranges in the file of the split",
             where="a draw",
-            expected="0 < low <= high",
-            got=(low, high),
-            fix="check the ranges in the file of the split",
         )
     exact_low = Decimal(low)
     exact_high = Decimal(high)
@@ -226,8 +220,7 @@ def choice(rng: RandomSource, count: int) -> int:
 def draw_integer(rng: RandomSource, low: float, high: float) -> int:
     """Draw an integer, end points included."""
     first = int(low)
-    last = int(high)
-    count = last - first + 1
+    count = int(high) - first + 1
     return first + choice(rng, count)
 
 
@@ -248,8 +241,7 @@ def direction_in_space(rng: RandomSource) -> tuple[float, float, float]:
     """Draw a unit vector, uniform over the sphere, as :func:`direction` does."""
     while True:
         unit = rng.random((3,))
-        vector = 2.0 * unit - 1.0
-        x, y, z = vector.tolist()
+        x, y, z = (2.0 * unit - 1.0).tolist()
         square = x * x + y * y + z * z
         if 2.0**-20 <= square <= 1.0:
             length = math.sqrt(square)
@@ -289,9 +281,7 @@ def draw_program(
         values_end = min(end, frame_count)
         frames = np.arange(values_end - start)  # since the knot
         s = frames / (end - start)
-        rise = s * s * (3.0 - 2.0 * s)
-        difference = end_value - start_value
-        gain = difference * rise
+        gain = (end_value - start_value) * (s * s * (3.0 - 2.0 * s))
         values[start:end] = start_value + gain
         start = end
         start_value = end_value
@@ -372,13 +362,10 @@ def _fill_columns(
     column_sizes = np.diff(ends)
     column_count = len(column_sizes)
     # column and row of each particle's cell, shape [particle]
-    columns = np.arange(column_count)
     starts = ends[:-1]
-    column = np.repeat(columns, column_sizes)
-    column_start = np.repeat(starts, column_sizes)
+    column = np.repeat(np.arange(column_count), column_sizes)
     particle_count = len(column)
-    particles = np.arange(particle_count)
-    row = particles - column_start
+    row = np.arange(particle_count) - np.repeat(starts, column_sizes)
     cell = np.stack([column, row], axis=-1)
     # cells across the square each way, shape [particle, 2]
     columns_across = np.full(particle_count, column_count)
@@ -389,6 +376,5 @@ def _fill_columns(
     displacement = centred * jitter
     middle = cell + 0.5
     place = middle + displacement  # [cells]
-    side = high - low
-    from_corner = side * place / cell_counts
+    from_corner = (high - low) * place / cell_counts
     return quantise(low + from_corner)

@@ -129,9 +129,8 @@ class Driver(ABC, Generic[Parameters]):
         """
         if len(states) != self.scenarios:
             raise UsageError(
-                "wrong number of scenarios",
-                expected=self.scenarios,
-                got=len(states),
+                f"wrong number of scenarios: got {len(states)}, expected "
+                f"{self.scenarios}",
             )
         for index, state in enumerate(states):
             self._check_state(index, state)
@@ -209,12 +208,10 @@ class Driver(ABC, Generic[Parameters]):
         if substeps == 1:
             span = f"substep {end}"
         return WorkFailedError(
-            "the simulation blew up",
+            f"the simulation blew up: got {'; '.join(broken.values())}, expected "
+            f"{'; '.join(broken)}; a smaller dt (a larger substeps_per_frame), a "
+            "softer material, a smaller viscosity or smaller velocities",
             where=f"scenario {index}, {span}",
-            expected="; ".join(broken),
-            got="; ".join(broken.values()),
-            fix="a smaller dt (a larger substeps_per_frame), a softer "
-            "material, a smaller viscosity or smaller velocities",
         )
 
     def _drive(self, end: int) -> int:
@@ -297,103 +294,46 @@ class Driver(ABC, Generic[Parameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         """Refuse a state that the kernels cannot start from."""
-        self._check_arrays(index, state)
-        material_values = [material.value for material in Material]
-        area = np.float64(state.area)
+        where = f"scenario {index}"
+        count = self.parameters.particles
+        dimension = self.dimension
+        shapes = {
+            "position": (count, dimension),
+            "velocity": (count, dimension),
+            "affine": (count, dimension, dimension),
+            "material": (count,),
+        }
+        for name, shape in shapes.items():
+            array = np.asarray(getattr(state, name))
+            kinds = "iu" if name == "material" else "f"
+            if array.shape != shape or array.dtype.kind not in kinds:
+                raise UsageError(
+                    f"{name} of an initial state has shape {array.shape}, "
+                    f"{array.dtype}; give {shape}, see docs/extending.md",
+                    where=where,
+                )
         position = np.asarray(state.position)
-        is_below = position < 0.0
-        is_above = position > 1.0
-        outside_count = np.count_nonzero(is_below | is_above)
-        is_known = np.isin(state.material, material_values)
-        has_area = 0.0 < area <= 1.0
-        if outside_count or not is_known.all() or not has_area:
+        is_outside = (position < 0.0) | (position > 1.0)
+        is_known = np.isin(state.material, [material.value for material in Material])
+        if is_outside.any() or not is_known.all() or not 0.0 < state.area <= 1.0:
             raise UsageError(
-                "no such initial state",
-                where=f"scenario {index}",
-                expected=f"positions in the unit box, materials of {material_values}, "
-                "an area up to 1",
-                got=f"{outside_count} coordinates outside, materials "
-                f"{np.unique(state.material)}, area {area:g}",
-                fix="mend the split's initial_state",
+                "an initial state needs positions in the unit box, known materials, "
+                "and an area up to 1; mend the split's initial_state",
+                where=where,
             )
 
         speed_bound = self._kernels.speed_bound
         speed = np.abs(state.velocity).max()
-        largest_slope = np.abs(state.affine).max()
-        stretch = largest_slope * self.parameters.dt
-        is_finite = np.isfinite(position)
-        is_within_bounds = speed <= speed_bound and stretch <= 2.0
-        if not is_finite.all() or not is_within_bounds:
+        stretch = np.abs(state.affine).max() * self.parameters.dt
+        is_finite = np.isfinite(position).all()
+        if not is_finite or not (speed <= speed_bound and stretch <= 2.0):
             raise WorkFailedError(
-                "the initial state is outside the solver's bounds",
-                where=f"scenario {index}",
-                expected=f"finite positions, abs(v) <= dx/dt = {speed_bound:.6g}, "
-                "abs(C) dt <= 2",
-                got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}, "
-                f"{np.count_nonzero(~is_finite)} coordinates that are not finite",
-                fix="draw finite positions and slower motion, or lower dt in the file "
-                "of the split",
+                "the initial state is outside the solver's bounds: got abs(v) = "
+                f"{speed:.6g}, abs(C) dt = {stretch:.6g}, expected finite positions, "
+                f"abs(v) <= dx/dt = {speed_bound:.6g}, abs(C) dt <= 2; draw slower "
+                "motion, or lower dt in the file of the split",
+                where=where,
             )
-
-    def _check_arrays(self, index: int, state: InitialState) -> None:
-        """Refuse arrays of another shape or kind of number than the kernels take."""
-        count = self.parameters.particles
-        dimension = self.dimension
-        vector_shape = (count, dimension)
-        matrix_shape = (count, dimension, dimension)
-        scalar_shape = (count,)
-        expected_arrays = (
-            ("position", vector_shape, "floating", "f"),
-            ("velocity", vector_shape, "floating", "f"),
-            ("affine", matrix_shape, "floating", "f"),
-            ("material", scalar_shape, "whole", "iu"),
-        )
-        for name, shape, number, kinds in expected_arrays:
-            array = np.asarray(getattr(state, name))
-            if array.shape != shape or array.dtype.kind not in kinds:
-                raise UsageError(
-                    f"wrong shape of {name} in an initial state, or no such numbers",
-                    where=f"scenario {index}",
-                    expected=f"{shape}, {number}",
-                    got=f"{array.shape}, {array.dtype}",
-                    fix="return such arrays from initial_state: docs/extending.md",
-                )
-
-
-def check_undriven(index: int, state: InitialState) -> None:
-    """Refuse what acts in full boxes of :class:`.FullBox` only.
-
-    Raises:
-        UsageError: the state has a body force, an obstacle or a stream.
-    """
-    for name in ("body_force", "obstacle", "stream"):
-        value = getattr(state, name)
-        if value is not None:
-            raise UsageError(
-                f"this solver knows no {name}",
-                where=f"scenario {index}, {name}",
-                expected="None",
-                got=type(value).__name__,
-                fix=f"leave {name} out of the initial state; or return "
-                "FullBoxParameters from solver_parameters",
-            )
-
-
-def check_no_friction(index: int, state: InitialState) -> None:
-    """Refuse friction of the walls, which only free surfaces have.
-
-    Raises:
-        UsageError: the friction is not 0.
-    """
-    if state.friction != 0.0:
-        raise UsageError(
-            "this solver knows no friction",
-            where=f"scenario {index}, friction",
-            expected="0",
-            got=state.friction,
-            fix="leave friction out of the initial state: no_slip of the constants "
-            "tells whether walls hold the fluid",
-        )
 
 
 def check_program(
@@ -410,27 +350,16 @@ def check_program(
     Raises:
         UsageError: it is no array of finite numbers, of another shape, or without rows.
     """
-    got = type(program).__name__
-    if isinstance(program, np.ndarray):
-        got = f"shape {program.shape}, {program.dtype}"
-        is_row = has_one_row and program.shape == row
-        is_program = program.shape[1:] == row and len(program) > 0
-        is_numeric = program.dtype.kind in "fiu"
-        if is_numeric and (is_row or is_program):
-            if np.isfinite(program).all():
-                return
-            got = "NaN or an infinite number"
-    row_shape = ", ".join(str(length) for length in row)
-    shape = f"shape [frame, {row_shape}]"
-    if has_one_row:
-        shape = f"{shape} or [{row_shape}]"
-    raise UsageError(
-        "a program of an initial state does not fit",
-        where=where,
-        expected=f"an array of finite numbers, {shape}",
-        got=got,
-        fix="correct what initial_state returns: docs/extending.md",
-    )
+    array = np.asarray(program)
+    is_row = has_one_row and array.shape == row
+    is_program = array.shape[1:] == row and len(array) > 0
+    is_numeric = array.dtype.kind in "fiu" and bool(np.isfinite(array).all())
+    if not is_numeric or not (is_row or is_program):
+        raise UsageError(
+            f"a program of an initial state has shape {array.shape}, {array.dtype}; "
+            f"give finite numbers of shape [frame, {', '.join(map(str, row))}]",
+            where=where,
+        )
 
 
 @ti.kernel

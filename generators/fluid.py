@@ -109,11 +109,8 @@ def _draw_splash(rng: RandomSource, body: Body, position: Array, size: Size) -> 
     total = np.zeros_like(position)
     weights = np.zeros((particle_count, 1))
     for centre, velocity in zip(body.shape.centres, blob_velocities, strict=True):
-        from_blob_centre = from_body_centre - np.array(centre)
-        x, y = from_blob_centre.T
-        square_distance = x * x + y * y
-        softened = square_distance + softening_square
-        inverse = 1.0 / softened
+        x, y = (from_body_centre - np.array(centre)).T
+        inverse = 1.0 / (x * x + y * y + softening_square)
         weight = inverse[:, None]  # shape [particle, 1]
         total = total + weight * velocity
         weights = weights + weight

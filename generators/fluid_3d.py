@@ -138,8 +138,7 @@ def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
     low, high = free_surface_walls(size)
     walls = (low, high)
     side = high - low
-    doubled_middle = low + high
-    middle = 0.5 * doubled_middle
+    middle = 0.5 * (low + high)
     width = draw_between(rng, size, "column_width")
     height = draw_between(rng, size, "column_height")
     half_width = 0.5 * width
@@ -166,8 +165,7 @@ def _splash(rng: RandomSource, size: Size) -> InitialState:
     low, high = free_surface_walls(size)
     walls = (low, high)
     side = high - low
-    doubled_middle = low + high
-    middle = 0.5 * doubled_middle
+    middle = 0.5 * (low + high)
     depth = draw_between(rng, size, "pool_depth")
     half_depth = 0.5 * depth
     sides = (side, depth, side)
@@ -179,9 +177,7 @@ def _splash(rng: RandomSource, size: Size) -> InitialState:
     radius = draw_between(rng, size, "drop_radius")
     ball = Ball(radius)
     margin = size.value("margin")
-    surface = low + depth
-    bottom = surface + margin
-    lowest = bottom + radius
+    lowest = low + depth + margin + radius
     ball_centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "drop_velocity")
     pool_body = _LiquidBody(pool, pool_centre, AT_REST)
@@ -211,9 +207,7 @@ def _state(
         count = left_count
         if index < last_index:
             volume = volumes[index]
-            volume_share = volume / total_volume
-            particle_share = particles * volume_share
-            count = int(particle_share)
+            count = int(particles * (volume / total_volume))
         left_count -= count
         centre = np.array(body.centre)
         place = Body(body.solid, centre)
@@ -224,9 +218,8 @@ def _state(
         velocities.append(body_velocity)
 
     low, high = free_surface_walls(size)
-    all_positions = np.concatenate(positions)
     all_velocities = np.concatenate(velocities)
-    position = np.clip(all_positions, low, high)
+    position = np.clip(np.concatenate(positions), low, high)
     velocity = quantise(all_velocities)
     affine_shape = (particles, 3, 3)
     affine = np.zeros(affine_shape)

@@ -18,10 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.field_errors import describe_value
 from lagbench.errors import UsageError
 
-from .driver import Driver, check_undriven, stack
+from .driver import Driver, stack
 from .free_surface_kernels import FreeSurfaceKernels
 from .particle_stress import ParticleStress
 from .solver import Health, Singles
@@ -47,10 +46,8 @@ def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     for material, sound_speed in sound_speeds(p).items():
         fastest = sound_speed
         if material is Material.SNOW:
-            stiffening = math.sqrt(p.snow_hardening_max)
-            fastest = sound_speed * stiffening
-        way = fastest * p.dt
-        numbers[material] = way * p.grid
+            fastest = sound_speed * math.sqrt(p.snow_hardening_max)
+        numbers[material] = fastest * p.dt * p.grid
     return numbers
 
 
@@ -88,24 +85,13 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
-        check_undriven(index, state)
-        if state.viscosity != 0.0:
+        has_walls = np.any(state.wall_velocity)
+        has_others = (state.body_force, state.obstacle, state.stream) != (None,) * 3
+        if state.viscosity != 0.0 or has_walls or has_others:
             raise UsageError(
-                "this solver knows no viscosity of a scenario",
-                where=f"scenario {index}, viscosity",
-                expected="0",
-                got=state.viscosity,
-                fix="leave viscosity out of the initial state: liquid_viscosity of the "
-                "constants is that of the liquid",
-            )
-        walls = np.asarray(state.wall_velocity)
-        if walls.dtype.kind not in "fiu" or walls.any():
-            raise UsageError(
-                "the walls of this solver cannot move",
-                where=f"scenario {index}, wall_velocity",
-                expected="zeros",
-                got=describe_value(state.wall_velocity),
-                fix="leave wall_velocity out of the initial state",
+                "a free surface knows no viscosity of a scenario, no moving wall, "
+                "body force, obstacle or stream; leave them out of the initial state",
+                where=f"scenario {index}",
             )
 
     def _start(self, states: Sequence[InitialState]) -> None:
@@ -143,14 +129,11 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         reach = extremes[..., 3]
         self._reach = reach.max(axis=1)
         # The kernels keep a huge number where they saw something that is none.
-        magnitude = np.abs(extremes)
-        is_number = magnitude < _LARGEST
-        extremes = np.where(is_number, extremes, np.nan)
+        extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
         healths = []
         for extreme in extremes:
             speed, jacobian_min, jacobian_max, _ = extreme.T
-            is_finite = np.isfinite(extreme)
-            all_finite = is_finite.all()
+            all_finite = np.isfinite(extreme).all()
             fastest = speed.max()
             least_jacobian = jacobian_min.min()
             greatest_jacobian = jacobian_max.max()
@@ -206,8 +189,7 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         deformation = self.deformation()
         determinant = np.linalg.det(deformation)
         ratio = self.volume_ratio()
-        is_liquid = self._material == Material.LIQUID
-        return np.where(is_liquid, ratio, determinant)
+        return np.where(self._material == Material.LIQUID, ratio, determinant)
 
     def energy(self) -> Energy:
         """Return the energy of each scenario, in float64 from the particles."""
@@ -219,26 +201,18 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         affine = _exact(self.affine())
 
         # abs(v)^2 + dx^2/4 abs(C)^2 of each particle, shape [scenario, particle]
-        velocity_squares = np.square(velocity)
         affine_squares = np.square(affine)
-        velocity_square = velocity_squares.sum(axis=-1)
+        velocity_square = np.square(velocity).sum(axis=-1)
         affine_square = affine_squares.sum(axis=(-2, -1))
-        divisor = 4.0 * p.grid**2
-        spin = affine_square / divisor
-        motion = velocity_square + spin
-        motion_sum = motion.sum(axis=-1)
-        half_mass = 0.5 * mass
-        kinetic = half_mass * motion_sum
+        motion = velocity_square + affine_square / (4.0 * p.grid**2)
+        kinetic = 0.5 * mass * motion.sum(axis=-1)
 
         y = position[..., 1]
         floor = self._kernels.position_min
-        height = y - floor
-        height_sum = height.sum(axis=-1)
-        gravitational = weight * height_sum
+        gravitational = weight * (y - floor).sum(axis=-1)
 
         elastic_density = self._elastic_density()
-        elastic_sum = elastic_density.sum(axis=-1)
-        elastic = self._volume * elastic_sum
+        elastic = self._volume * elastic_density.sum(axis=-1)
         return Energy(
             kinetic=kinetic,
             gravitational=gravitational,
@@ -255,37 +229,26 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         # is negative.
         stretches = np.linalg.svd(f, compute_uv=False)
         jacobian = np.linalg.det(f)
-        sign = np.sign(jacobian)
-        stretches[..., -1] *= sign
-        strains = stretches - 1.0
-        strain_squares = np.square(strains)
-        shear = strain_squares.sum(axis=-1)
-        volume_change = jacobian - 1.0
-        bulk = 0.5 * volume_change**2
+        stretches[..., -1] *= np.sign(jacobian)
+        shear = np.square(stretches - 1.0).sum(axis=-1)
+        bulk = 0.5 * (jacobian - 1.0) ** 2
 
-        compaction = 1.0 - ratio
-        exponent = p.snow_hardening * compaction
-        hardening = np.exp(exponent)
+        hardening = np.exp(p.snow_hardening * (1.0 - ratio))
         least_hardening = p.snow_hardening_min
         greatest_hardening = p.snow_hardening_max
         hardening = np.clip(hardening, least_hardening, greatest_hardening)
 
-        logarithm = np.log(ratio)
-        compression = ratio - 1.0 - logarithm
-        density = p.liquid_modulus * compression
+        density = p.liquid_modulus * (ratio - 1.0 - np.log(ratio))
         moduli = {
             Material.JELLY: kernels.jelly,
             Material.ROPE: kernels.rope,
             Material.SNOW: kernels.snow,
         }
         for material, (mu, la) in moduli.items():
-            shear_energy = mu * shear
-            bulk_energy = la * bulk
-            psi = shear_energy + bulk_energy
+            psi = mu * shear + la * bulk
             if material is Material.SNOW:
                 psi = psi * hardening
-            is_material = self._material == material
-            density = np.where(is_material, psi, density)
+            density = np.where(self._material == material, psi, density)
         return np.asarray(density)
 
 
@@ -303,8 +266,7 @@ class FreeSurface(FreeSurfaceDriver):
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
         particle, 2, 2].
         """
-        gradients = self._kernels.deformation.to_numpy()
-        return np.asarray(gradients)
+        return np.asarray(self._kernels.deformation.to_numpy())
 
     def _set_deformation(self, gradients: Singles) -> None:
         self._kernels.deformation.from_numpy(gradients)

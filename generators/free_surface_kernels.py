@@ -133,9 +133,7 @@ class FreeSurfaceKernels:
         Args:
             material: Material of each particle, shape [scenario, particle].
         """
-        is_solid = material != LIQUID
-        any_solid = is_solid.any()
-        self.solid = bool(any_solid)
+        self.solid = bool((material != LIQUID).any())
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread, on the nodes that
@@ -176,9 +174,7 @@ class FreeSurfaceKernels:
             x = self.x[0, p]
             for axis in ti.static(range(self.dimension)):
                 coordinate = x[axis]
-                scaled = coordinate * self.inv_dx
-                shifted_place = scaled - 0.5
-                base = ti.cast(shifted_place, i32)
+                base = ti.cast(coordinate * self.inv_dx - 0.5, i32)
                 particle_end = base + 3
                 old_first = first[axis]
                 old_end = end[axis]
@@ -223,17 +219,12 @@ class FreeSurfaceKernels:
         """
         density = larger(grid_density, 1.0)
         volume = 1.0 / density
-        expansion = self.dt * divergence
-        growth = expansion * old_jacobian
-        jacobian = old_jacobian + growth
+        jacobian = old_jacobian + self.dt * divergence * old_jacobian
 
         lag = grid_jacobian - old_jacobian
-        relaxation = self.parameters.jacobian_relaxation * lag
-        jacobian += relaxation
+        jacobian += self.parameters.jacobian_relaxation * lag
 
-        compression = volume - jacobian
-        coupling = self.parameters.density_coupling * compression
-        jacobian += coupling
+        jacobian += self.parameters.density_coupling * (volume - jacobian)
         jacobian_min = self.parameters.jacobian_min
         jacobian_max = self.parameters.jacobian_max
         return bounded(jacobian, jacobian_min, jacobian_max)
@@ -249,8 +240,7 @@ class FreeSurfaceKernels:
 @ti.func
 def finite(value: f32) -> f32:
     """Return a positive value, or :data:`_HUGE` if it is not a finite number."""
-    is_number = value < _HUGE
-    return ti.select(is_number, value, _HUGE)
+    return ti.select(value < _HUGE, value, _HUGE)
 
 
 @ti.func

@@ -155,8 +155,7 @@ def _keeps_gap(
     is_inside = second.distance(nodes) <= 0.0
     inner_nodes = nodes[is_inside]
     distance = first.distance(inner_nodes)
-    least_distance = float(distance.min())
-    return least_distance >= gap
+    return float(distance.min()) >= gap
 
 
 def _are_apart(bodies: Sequence[Body], offsets: Sequence[Array], gap: float) -> bool:
@@ -195,11 +194,10 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
         if _are_apart(bodies, offsets, gap):
             return bodies
     raise WorkFailedError(
-        f"{len(shapes)} bodies have no room side by side",
+        f"{len(shapes)} bodies have no room side by side: got bodies that touch or "
+        f"overlap, in every attempt, expected a gap of {gap} within {_ATTEMPTS} "
+        "attempts; lower the areas or lengths in the file of the split",
         where=f"{size.split} {size.name}",
-        expected=f"a gap of {gap} within {_ATTEMPTS} attempts",
-        got="bodies that touch or overlap, in every attempt",
-        fix="lower the areas or lengths in the file of the split",
     )
 
 
@@ -234,12 +232,9 @@ def _share_particles(particle_count: int, measures: Sequence[float]) -> list[int
     area = add_in_order(measures)
     counts = []
     for body_area in measures[:-1]:
-        share = particle_count * body_area / area
-        raised_share = share + 0.5
-        count = math.floor(raised_share)
+        count = math.floor(particle_count * body_area / area + 0.5)
         counts.append(count)
-    count_so_far = sum(counts)
-    last_count = particle_count - count_so_far
+    last_count = particle_count - sum(counts)
     counts.append(last_count)
     return counts
 
@@ -248,10 +243,8 @@ def _materials(size: Size, scenario: int) -> tuple[Material, ...]:
     """Return the materials of the bodies of a scenario."""
     number = shift_number(size, scenario)
     if number is None:
-        pair = scenario % len(PAIRS)
-        return PAIRS[pair]
-    triple = number % len(TRIPLES)
-    return TRIPLES[triple]
+        return PAIRS[scenario % len(PAIRS)]
+    return TRIPLES[number % len(TRIPLES)]
 
 
 def _draw_attractor(rng: RandomSource, size: Size) -> Array:
@@ -296,8 +289,7 @@ def draw_bodies(
     rate = draw_between(rng, size, "attraction")
     velocities = []
     for body in bodies:
-        way = point - body.centre
-        exact_velocity = rate * way
+        exact_velocity = rate * (point - body.centre)
         velocity = quantise(exact_velocity)
         velocities.append(velocity)
 

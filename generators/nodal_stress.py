@@ -136,13 +136,9 @@ class NodalStress:
         self.dt = p.dt
         self.origin = p.origin  # coordinate of node 0 of each axis [cells]
         # smallest and largest coordinate of a particle along each axis
-        wall_inset = _INSET * dx
-        inset = np.where(box.periodic, 0.0, wall_inset)
-        low_faces = np.array(box.low)
-        high_faces = np.array(box.high)
-        position_min = low_faces + inset
-        position_max = high_faces - inset
-        self.position_min = position_min.tolist()
+        inset = np.where(box.periodic, 0.0, _INSET * dx)
+        position_max = np.array(box.high) - inset
+        self.position_min = (np.array(box.low) + inset).tolist()
         self.position_max = position_max.tolist()
         period = box.lengths
         self.period = period.tolist()
@@ -160,14 +156,10 @@ class NodalStress:
         self.cell_scale = velocity_scale * dx
 
         # dt E / (2 rho dx): gain of velocity by a difference of Jbar over two cells
-        double_density = p.density * 2.0
-        divisor = double_density * dx
-        timed_modulus = p.dt * p.modulus
-        self.pressure_factor = timed_modulus / divisor
+        self.pressure_factor = p.dt * p.modulus / (p.density * 2.0 * dx)
         self.slope_factor = 4.0 * self.inv_dx  # 4/dx
         # -beta dx^2
-        shift_per_cell = -p.shift * dx
-        self.shift_factor = shift_per_cell * dx
+        self.shift_factor = -p.shift * dx * dx
         self.shift_bound = 0.1 * dx
 
         self._make_stencils()
@@ -205,10 +197,7 @@ class NodalStress:
         # axes along which the two differ
         weights = []
         for further in range(dimension):
-            equal_axes = row_axes - further
-            equal_weight = 0.75**equal_axes
-            further_weight = 0.125**further
-            weight = equal_weight * further_weight
+            weight = 0.75 ** (row_axes - further) * 0.125**further
             weights.append(weight)
         self.pair_weight = tuple(weights)
         self.further_counts = tuple(range(1, dimension))
@@ -355,25 +344,19 @@ class NodalStress:
         row_with_ghosts = tables.index[:, 1]
         row = row_with_ghosts - 1
         row = np.clip(row, 0, last_row)
-        scaled_row = row * self.layer_count
-        layer = scaled_row // row_count
-        layer_number = layer.astype(np.int32)
+        layer_number = (row * self.layer_count // row_count).astype(np.int32)
         self.force_layer.from_numpy(layer_number)
 
         if self.has_fringe:
             places = self._node_places()
             x = places[:, 0]
             rates = self.parameters.fringe_rates(x)
-            damping = self.dt * rates
-            rounded_damping = damping.astype(np.float32)
+            rounded_damping = (self.dt * rates).astype(np.float32)
             self.fringe_damping.from_numpy(rounded_damping)
 
     def _node_places(self) -> NDArray[np.float64]:
         """Return where the nodes lie [length], ghosts included, shape [node, axis]."""
-        origin = np.array(self.origin)
-        cells = self.tables.index + origin
-        places = cells / self.inv_dx
-        return np.asarray(places)
+        return np.asarray((self.tables.index + np.array(self.origin)) / self.inv_dx)
 
     def move_walls(self, velocity: Singles) -> None:
         """Let walls slide [length/s], shape [scenario, 2 axis, axis]."""
@@ -385,8 +368,7 @@ class NodalStress:
     def apply_force(self, acceleration: Singles) -> None:
         """Let a force act [length/s^2], shape [scenario, layer, axis]."""
         scenarios, layers, dimension = acceleration.shape
-        dt = np.float32(self.dt)
-        velocity_gain = dt * acceleration
+        velocity_gain = np.float32(self.dt) * acceleration
         shape = (scenarios, layers, LANES)
         gain = np.zeros(shape, np.float32)
         gain[..., :dimension] = velocity_gain
@@ -408,8 +390,7 @@ class NodalStress:
             mask[s] = ~is_solid
             disc = discs[s]
             disc[: self.dimension] = centre
-            least_distance = radius + inset
-            disc[3] = least_distance
+            disc[3] = radius + inset
         self.fluid_mask.from_numpy(mask)
         self.obstacle.from_numpy(discs)
 
@@ -447,20 +428,16 @@ class NodalStress:
             coordinate = x[axis]
             from_zero = coordinate * self.inv_dx  # [cells]
             scaled = from_zero - origin
-            half_below = scaled - 0.5
-            lowest = ti.cast(half_below, i32)
+            lowest = ti.cast(scaled - 0.5, i32)
             # A periodic coordinate may round up to the end of its last cell.
             lowest = ti.min(lowest, last_cell)
-            node = ti.cast(lowest, f32)
-            f = scaled - node
+            f = scaled - ti.cast(lowest, f32)
             low, mid, high = spline_weights(f)
             weights = vec4(low, mid, high, 0.0)
             self.weights[axis][s, p] = weights
-            from_middle = f - 1.0
-            offset[axis] = from_middle
+            offset[axis] = f - 1.0
             stride = self.stride[axis]
-            nodes_before = lowest * stride
-            number += nodes_before
+            number += lowest * stride
         number_bits = ti.bit_cast(number, f32)
         place = vec4(offset, number_bits)
         self.stencil_place[s, p] = place
@@ -505,9 +482,7 @@ class NodalStress:
         number = lowest
         for axis in ti.static(self.row_axes):
             stride = self.stride[axis]
-            steps_from_low = step[axis] + 1
-            nodes_before = steps_from_low * stride
-            number += nodes_before
+            number += (step[axis] + 1) * stride
         return number
 
     @ti.func
@@ -530,14 +505,10 @@ class NodalStress:
         step_z = slope_scale * slope_z
 
         particle_state = self.particle_state[s, p]
-        at_particle = scale * particle_state
-        way_x = place.x * step_x
-        way_y = place.y * step_y
-        at_middle = at_particle - way_x
-        at_middle = at_middle - way_y
+        at_middle = scale * particle_state - place.x * step_x
+        at_middle = at_middle - place.y * step_y
         if ti.static(self.has_z):
-            way_z = place.z * step_z
-            at_middle = at_middle - way_z
+            at_middle = at_middle - place.z * step_z
 
         for step in ti.static(self.row_steps):
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
@@ -562,15 +533,13 @@ class NodalStress:
         """Take the shifts off a node's sums, and add up its n from three rows."""
         weight_sum, shifts = row_count(self.row_sums, s, n)
         shifted_total = self.sums[s, n]
-        total = shifted_total - shifts
-        self.sums[s, n] = total
+        self.sums[s, n] = shifted_total - shifts
         self.weight_sum[s, n] = weight_sum
 
     @ti.func
     def image_sign(self, k: Template) -> Value:
         """Return the signs with which the k-th image of a node counts for (v, J)."""
-        signs = ti.static(self.image_signs[k])
-        return ti.Vector(signs, i64)
+        return ti.Vector(ti.static(self.image_signs[k]), i64)
 
     @ti.func
     def add_images(self, s: i32, e: i32) -> None:
@@ -585,14 +554,12 @@ class NodalStress:
                 ghost_weight = self.weight_sum[s, ghost]
                 ghost_total = self.sums[s, ghost]
                 sign = self.image_sign(k)
-                mirrored_total = sign * ghost_total
-                total += mirrored_total
+                total += sign * ghost_total
                 weight_sum += ghost_weight
                 if ti.static(self.has_walls):
                     ghost_count = from_fixed(ghost_weight, self.count_unit)
                     drag_per_particle = self.image_drag[s, e, k]
-                    wall_drag = drag_per_particle * ghost_count
-                    drag += wall_drag
+                    drag += drag_per_particle * ghost_count
         self.sums[s, n] = total
         self.weight_sum[s, n] = weight_sum
         self.drag[s, n] = drag
@@ -609,10 +576,8 @@ class NodalStress:
             count = from_fixed(weight_sum, self.count_unit)
             received = from_fixed(total, self.velocity_unit)
             drag = self.drag[s, n]
-            momentum = received + drag
-            state = momentum / count
-            density = count * particle_volume
-            state[3] = density
+            state = (received + drag) / count
+            state[3] = count * particle_volume
             jacobian_sum = from_fixed(jacobian_total, self.count_unit)
             jacobian = jacobian_sum / count
         self.node_state[s, n] = state
@@ -627,9 +592,7 @@ class NodalStress:
         drive = self.ghost_drive[s, g]
         state = self.node_state[s, source]
         jacobian = self.node_jacobian[s, source]
-        mirrored_state = sign * state
-        ghost_state = mirrored_state + drive
-        self.node_state[s, n] = ghost_state
+        self.node_state[s, n] = sign * state + drive
         self.node_jacobian[s, n] = jacobian
 
     @ti.func
@@ -641,10 +604,8 @@ class NodalStress:
         drive = self.ghost_drive[s, g]
         state = self.next_state[s, source]
         gain = self.node_gain[s, source]
-        mirrored_state = sign * state
-        ghost_state = mirrored_state + drive
         ghost_gain = sign * gain
-        self.next_state[s, n] = ghost_state
+        self.next_state[s, n] = sign * state + drive
         self.node_gain[s, n] = ghost_gain
 
     @ti.func
@@ -653,9 +614,7 @@ class NodalStress:
         number = n
         for axis in ti.static(self.axes):
             stride = self.stride[axis]
-            steps = side * step[axis]
-            nodes_between = steps * stride
-            number += nodes_between
+            number += side * step[axis] * stride
         return number
 
     @ti.func
@@ -683,8 +642,7 @@ class NodalStress:
             for further in ti.static(self.further_counts):
                 weight = self.pair_weight[further]
                 further_rise = rises[further, axis]
-                further_slope = weight * further_rise
-                slope = slope + further_slope
+                slope = slope + weight * further_rise
             gradient[axis] = slope
         return gradient
 
@@ -697,12 +655,9 @@ class NodalStress:
             behind = self.neighbour(n, step, -1)
             state_ahead = self.node_state[s, ahead]
             state_behind = self.node_state[s, behind]
-            pair_sum = state_ahead + state_behind
-            neighbour_sum = neighbour_sum + pair_sum
+            neighbour_sum = neighbour_sum + (state_ahead + state_behind)
         middle = self.node_state[s, n]
-        neighbour_count = 2.0 * self.dimension
-        middle_sum = neighbour_count * middle
-        return neighbour_sum - middle_sum
+        return neighbour_sum - 2.0 * self.dimension * middle
 
     @ti.func
     def add_forces(self, s: i32, n: i32) -> None:
@@ -712,19 +667,15 @@ class NodalStress:
         gradient = self.pressure_gradient(s, n)
         laplacian = self.laplacian(s, n)
         diffusion = self.diffusion_number[s]
-        pressure_gain = self.pressure_factor * gradient
-        viscous_gain = diffusion * laplacian
-        gain = pressure_gain + viscous_gain
+        gain = self.pressure_factor * gradient + diffusion * laplacian
         if ti.static(self.has_force):
             layer = self.force_layer[n]
             force_gain = self.force_gain[s, layer]
             gain = gain + force_gain
         if ti.static(self.has_fringe):
             stream = self.stream[s]
-            lag = stream - state
             damping = self.fringe_damping[n]
-            fringe_gain = damping * lag
-            gain = gain + fringe_gain
+            gain = gain + damping * (stream - state)
         v = state + gain
         if ti.static(self.has_obstacle):
             mask = self.fluid_mask[s, n]
@@ -772,8 +723,7 @@ class NodalStress:
                 node_state = self.next_state[s, node]
                 share = weight * node_state
                 node_gain = self.node_gain[s, node]
-                gain_share = weight * node_gain
-                gain += gain_share
+                gain += weight * node_gain
                 state += share
                 moment_x = stepped(moment_x, share, step[0])
                 moment_y = stepped(moment_y, share, k - 1)
@@ -781,13 +731,10 @@ class NodalStress:
         self.grid_gain[s, p] = gain
 
         # from there to the particle
-        shift_x = place.x * state
-        shift_y = place.y * state
-        moment_x = moment_x - shift_x
-        moment_y = moment_y - shift_y
-        slope_x = self.slope_factor * moment_x
+        moment_x = moment_x - place.x * state
+        moment_y = moment_y - place.y * state
         slope_y = self.slope_factor * moment_y
-        self.slopes[0][s, p] = slope_x
+        self.slopes[0][s, p] = self.slope_factor * moment_x
         self.slopes[1][s, p] = slope_y
 
     @ti.func
@@ -817,38 +764,31 @@ class NodalStress:
             mid_state = self.next_state[s, middle]
             high_state = self.next_state[s, last]
             low_share = low_weight * low_state
-            mid_share = mid_weight * mid_state
             high_share = high_weight * high_state
-            row_state = low_share + mid_share + high_share
+            row_state = low_share + mid_weight * mid_state + high_share
 
             low_gain = self.node_gain[s, start]
             mid_gain = self.node_gain[s, middle]
             high_gain = self.node_gain[s, last]
             low_gain_share = low_weight * low_gain
             mid_gain_share = mid_weight * mid_gain
-            high_gain_share = high_weight * high_gain
-            row_gain = low_gain_share + mid_gain_share + high_gain_share
+            row_gain = low_gain_share + mid_gain_share + high_weight * high_gain
 
             state += row_state
             gain += row_gain
             moment_x = stepped(moment_x, row_state, step[0])
             moment_y = stepped(moment_y, row_state, step[1])
-            row_moment = high_share - low_share
-            moment_z += row_moment
+            moment_z += high_share - low_share
         self.grid_state[s, p] = state
         self.grid_gain[s, p] = gain
 
         # from there to the particle
-        shift_x = place.x * state
-        shift_y = place.y * state
-        shift_z = place.z * state
-        moment_x = moment_x - shift_x
-        moment_y = moment_y - shift_y
-        moment_z = moment_z - shift_z
-        slope_x = self.slope_factor * moment_x
+        moment_x = moment_x - place.x * state
+        moment_y = moment_y - place.y * state
+        moment_z = moment_z - place.z * state
         slope_y = self.slope_factor * moment_y
         slope_z = self.slope_factor * moment_z
-        self.slopes[0][s, p] = slope_x
+        self.slopes[0][s, p] = self.slope_factor * moment_x
         self.slopes[1][s, p] = slope_y
         self.slopes[2][s, p] = slope_z
 
@@ -867,9 +807,7 @@ class NodalStress:
         old_velocity = old_state.xyz
         old_jacobian = old_state[3]
         v = old_velocity + velocity_gain
-        velocity_lag = grid_velocity - v
-        relaxation = self.parameters.velocity_relaxation * velocity_lag
-        v = v + relaxation
+        v = v + self.parameters.velocity_relaxation * (grid_velocity - v)
 
         shift = vec3(0.0)
         shift_change = vec3(0.0)  # of the velocity, along the shift
@@ -898,10 +836,8 @@ class NodalStress:
         for axis in ti.static(self.axes):
             flow_speed = grid_velocity[axis]
             axis_shift = shift[axis]
-            flow_step = self.dt * flow_speed
-            step = flow_step + axis_shift
             old_coordinate = old_x[axis]
-            target = old_coordinate + step
+            target = old_coordinate + (self.dt * flow_speed + axis_shift)
             coordinate = self.kept_inside(target, axis)
             inside[axis] = coordinate
         x = inside
@@ -909,9 +845,7 @@ class NodalStress:
             # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
             x = self.kept_outside(s, inside)
 
-        strain = self.dt * divergence
-        growth = strain * old_jacobian
-        flowed = old_jacobian + growth
+        flowed = old_jacobian + self.dt * divergence * old_jacobian
         jacobian = self.relaxed(flowed, old_jacobian, grid_jacobian, volume)
         state = vec4(v, jacobian)
         self.particle_state[s, p] = state
@@ -953,10 +887,8 @@ class NodalStress:
     ) -> f32:
         """Return J_p, after the flow changed it, drawn towards Jbar and 1/r."""
         lag = grid_jacobian - old_jacobian
-        relaxation = self.parameters.jacobian_relaxation * lag
-        compression = volume - grid_jacobian
-        coupling = self.parameters.density_coupling * compression
-        return flowed + relaxation + coupling
+        coupling = self.parameters.density_coupling * (volume - grid_jacobian)
+        return flowed + self.parameters.jacobian_relaxation * lag + coupling
 
     @ti.func
     def kept_outside(self, s: i32, target: vec3) -> Value:
@@ -965,22 +897,14 @@ class NodalStress:
         centre = obstacle.xyz
         radius = obstacle[3]
         way = target - centre
-        square_x = way.x * way.x
-        square_y = way.y * way.y
-        square_z = way.z * way.z
-        square = square_x + square_y + square_z
+        square = way.x * way.x + way.y * way.y + way.z * way.z
         radius_square = radius * radius
         # A place at the very centre has no nearest one; it stays.
         is_near = square < radius_square
         is_off_centre = square > 0.0
         is_inside = is_near and is_off_centre
-        safe_square = ti.select(is_inside, square, 1.0)
-        distance = ti.sqrt(safe_square)
-        stretch = radius / distance
-        excess = stretch - 1.0
-        way_out = excess * way
-        on_surface = target + way_out
-        return ti.select(is_inside, on_surface, target)
+        way_out = (radius / ti.sqrt(ti.select(is_inside, square, 1.0)) - 1.0) * way
+        return ti.select(is_inside, target + way_out, target)
 
     @ti.func
     def kept_inside(self, target: f32, axis: Template) -> f32:
@@ -990,15 +914,10 @@ class NodalStress:
         x = target
         if ti.static(self.periodic[axis]):
             period = self.period[axis]
-            is_above = x >= high
-            lowered = x - period
-            x = ti.select(is_above, lowered, x)
-            is_below = x < low
-            raised = x + period
-            x = ti.select(is_below, raised, x)
+            x = ti.select(x >= high, x - period, x)
+            x = ti.select(x < low, x + period, x)
             # The sum may round up to the end of the period; NaN becomes its start.
-            is_within = x < high
-            x = ti.select(is_within, x, low)
+            x = ti.select(x < high, x, low)
         else:
             x = bounded(x, low, high)
         return x
@@ -1144,8 +1063,7 @@ class NodalStress:
             extremes = vec4(speed, jacobian)
             self.extremes[s, p] = extremes
             # this lane keeps the largest -J
-            minus_jacobian = -jacobian
-            self.x[s, p][3] = minus_jacobian
+            self.x[s, p][3] = -jacobian
         ti.loop_config(serialize=is_serial)
         for s, n in ti.ndrange(scenarios, nodes):
             self.peak_speed[s, n] = 0.0

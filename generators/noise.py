@@ -73,13 +73,9 @@ class Jet:
         value = f * g
         x = f_x * g + f * g_x
         y = f_y * g + f * g_y
-        product_x = f_x * g_x
-        product_y = f_y * g_y
-        crossed_xx = 2.0 * product_x
-        crossed_yy = 2.0 * product_y
-        xx = f_xx * g + crossed_xx + f * g_xx
+        xx = f_xx * g + 2.0 * (f_x * g_x) + f * g_xx
         xy = f_xy * g + f_x * g_y + f_y * g_x + f * g_xy
-        yy = f_yy * g + crossed_yy + f * g_yy
+        yy = f_yy * g + 2.0 * (f_y * g_y) + f * g_yy
         return Jet(value, x, y, xx, xy, yy)
 
     def scale(self, factor: Array | float) -> Jet:
@@ -144,14 +140,11 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     Eqs. 5.40 and 5.41 of the thesis. It is 0 at every node and its slope there is the
     node's gradient. The lattice has the shape [node, node, 2].
     """
-    node_count = len(lattice)
-    last = node_count - 2
+    last = len(lattice) - 2
     place_x = x.value
     place_y = y.value
-    floor_x = np.floor(place_x)
-    floor_y = np.floor(place_y)
-    column = floor_x.astype(np.int64)
-    row = floor_y.astype(np.int64)
+    column = np.floor(place_x).astype(np.int64)
+    row = np.floor(place_y).astype(np.int64)
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.
     i = np.minimum(column, last)
     j = np.minimum(row, last)
@@ -181,15 +174,8 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     low_right = corner(1, 0)
     high_left = corner(0, 1)
     high_right = corner(1, 1)
-    low_rise = low_right - low_left
-    high_rise = high_right - high_left
-    low_gain = u * low_rise
-    high_gain = u * high_rise
-    low = low_left + low_gain
-    high = high_left + high_gain
-    rise = high - low
-    gain = w * rise
-    return low + gain
+    low = low_left + u * (low_right - low_left)
+    return low + w * (high_left + u * (high_right - high_left) - low)
 
 
 def ramp(t: Jet) -> Jet:

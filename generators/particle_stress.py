@@ -155,9 +155,7 @@ class ParticleStress(FreeSurfaceKernels):
         self.locate(s, p)
         c = self.velocity_gradient(s, p)
         tau = self.stress(s, p, c, solid)
-        affine_part = self.dx * c
-        stress_part = self.stress_factor * tau
-        a = affine_part - stress_part
+        a = self.dx * c - self.stress_factor * tau
         self.keep_reach(s, p, a)
 
         scaled = self.velocity_scale * a
@@ -189,12 +187,8 @@ class ParticleStress(FreeSurfaceKernels):
         xy = slope[0, 1]
         yx = slope[1, 0]
         yy = slope[1, 1]
-        slope_of_x = xx + xy
-        slope_of_y = yx + yy
-        gain_x = 1.5 * slope_of_x
-        gain_y = 1.5 * slope_of_y
-        reach_x = speed.x + gain_x
-        reach_y = speed.y + gain_y
+        reach_x = speed.x + 1.5 * (xx + xy)
+        reach_y = speed.y + 1.5 * (yx + yy)
         reach = largest_of(reach_x, reach_y)
 
         extremes = self.extremes[s, p]
@@ -218,10 +212,8 @@ class ParticleStress(FreeSurfaceKernels):
         step_y = self.momentum_slope_y[s, p]
 
         base, offset = base_node(self.weight_rows, s, p)
-        change_x = offset.x * step_x
-        change_y = offset.y * step_y
-        at_middle = at_particle - change_x
-        at_middle = at_middle - change_y
+        at_middle = at_particle - offset.x * step_x
+        at_middle = at_middle - offset.y * step_y
 
         for i in ti.static(range(3)):
             column = base + i * self.width
@@ -237,8 +229,7 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def at(self, i: i32, j: i32) -> i32:
         """Return the number of a node."""
-        column = i * self.width
-        return column + j
+        return i * self.width + j
 
     @ti.func
     def clear(self, s: i32, i: i32, j: i32) -> None:
@@ -289,9 +280,7 @@ class ParticleStress(FreeSurfaceKernels):
             impact_speed = ti.abs(normal)
             sliding_speed = ti.abs(tangential)
             divisor = larger(sliding_speed, 1e-9)
-            friction_loss = friction * impact_speed
-            lost = friction_loss / divisor
-            kept = 1.0 - lost
+            kept = 1.0 - friction * impact_speed / divisor
             kept = larger(kept, 0.0)
             new_normal = 0.0
             new_tangential = tangential * kept
@@ -342,17 +331,15 @@ class ParticleStress(FreeSurfaceKernels):
                 weight = weights[j]
                 node_state = self.node_state[s, node]
                 share = weight * node_state
-                distance_y = (j - 1.0) - offset.y
                 share_x = distance_x * share
-                share_y = distance_y * share
+                share_y = (j - 1.0 - offset.y) * share
                 state += share
                 moment_x += share_x
                 moment_y += share_y
 
         slope_factor = 4.0 * self.inv_dx
-        slope_x = slope_factor * moment_x
         slope_y = slope_factor * moment_y
-        self.slope_x[s, p] = slope_x
+        self.slope_x[s, p] = slope_factor * moment_x
         self.slope_y[s, p] = slope_y
         self.grid_state[s, p] = state
 
@@ -364,9 +351,8 @@ class ParticleStress(FreeSurfaceKernels):
         grid_jacobian = grid_state[3]
         velocity = grid_state.xy
         old_x = self.x[s, p]
-        step = self.dt * velocity
         old_position = old_x.xy
-        moved = old_position + step
+        moved = old_position + self.dt * velocity
         inside = bounded(moved, self.position_min, self.position_max)
         x = vec4(inside, 0.0, 0.0)
         self.x[s, p] = x
@@ -387,22 +373,18 @@ class ParticleStress(FreeSurfaceKernels):
             is_snow = kind == SNOW
             is_liquid = kind == LIQUID
             old_f = self.deformation[s, p]
-            rate = c @ old_f
-            change = self.dt * rate
-            trial = old_f + change
+            trial = old_f + self.dt * (c @ old_f)
             least_stretch = self.yield_low
             greatest_stretch = self.yield_high
             yielded, growth = plastic_return(trial, least_stretch, greatest_stretch)
-            solid_f = ti.select(is_snow, yielded, trial)
-            f = ti.select(is_liquid, old_f, solid_f)
+            f = ti.select(is_liquid, old_f, ti.select(is_snow, yielded, trial))
             self.deformation[s, p] = f
 
             jp_min = self.parameters.snow_jp_min
             jp_max = self.parameters.snow_jp_max
             jp = old_ratio * growth
             jp = bounded(jp, jp_min, jp_max)
-            solid_ratio = ti.select(is_snow, jp, old_ratio)
-            ratio = ti.select(is_liquid, j, solid_ratio)
+            ratio = ti.select(is_liquid, j, ti.select(is_snow, jp, old_ratio))
             solid_jacobian = determinant(f)
             jacobian = ti.select(is_liquid, j, solid_jacobian)
             spread_jacobian = ti.select(is_liquid, j, 1.0)

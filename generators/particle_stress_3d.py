@@ -153,9 +153,7 @@ class ParticleStress3D(FreeSurfaceKernels):
     def _place_fields(self) -> None:
         """Give the fields their memory, each an array of its own."""
         super()._place_fields()
-        filled_blocks = self.particles / _LANES
-        blocks = math.ceil(filled_blocks)
-        list_length = _LANES * blocks
+        list_length = _LANES * math.ceil(self.particles / _LANES)
         list_shape = (list_length,)
         listed = (
             self.solids,
@@ -182,10 +180,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         super().sort_by_material(material)
         first_material = material[0]
         is_snow = first_material == SNOW
-        is_solid = first_material != LIQUID
-        is_other_solid = is_solid & ~is_snow
         snow = np.flatnonzero(is_snow)
-        other_solids = np.flatnonzero(is_other_solid)
+        other_solids = np.flatnonzero((first_material != LIQUID) & ~is_snow)
         solids = np.concatenate([snow, other_solids])
         self.snow_count = len(snow)
         self.solid_count = len(solids)
@@ -200,9 +196,7 @@ class ParticleStress3D(FreeSurfaceKernels):
     def at(self, i: i32, j: i32, k: i32) -> i32:
         """Return the number of a node."""
         width = self.width
-        rows_before = i * width + j
-        nodes_before = rows_before * width
-        return nodes_before + k
+        return (i * width + j) * width + k
 
     @ti.func
     def clear(self, s: i32, n: i32) -> None:
@@ -225,18 +219,14 @@ class ParticleStress3D(FreeSurfaceKernels):
         for axis in ti.static(_AXES):
             coordinate = x[axis]
             scaled = coordinate * self.inv_dx
-            half_below = scaled - 0.5
-            lowest = ti.cast(half_below, i32)
-            node = ti.cast(lowest, f32)
-            f = scaled - node
+            lowest = ti.cast(scaled - 0.5, i32)
+            f = scaled - ti.cast(lowest, f32)
             low, mid, high = spline_weights(f)
             weights = vec4(low, mid, high, 0.0)
             self.weights[axis][s, p] = weights
-            from_middle = f - 1.0
-            offset[axis] = from_middle
+            offset[axis] = f - 1.0
             stride = self.stride[axis]
-            nodes_before = lowest * stride
-            number += nodes_before
+            number += lowest * stride
         number_bits = ti.bit_cast(number, f32)
         place = vec4(offset, number_bits)
         self.stencil_place[s, p] = place
@@ -245,9 +235,7 @@ class ParticleStress3D(FreeSurfaceKernels):
     def row_start(self, lowest: i32, i: Template, j: Template) -> i32:
         """Return the number of the first node of a row of a particle's stencil."""
         width = self.width
-        rows_before = i * width + j
-        nodes_before = rows_before * width
-        return lowest + nodes_before
+        return lowest + (i * width + j) * width
 
     @ti.func
     def velocity_gradient(self, s: i32, p: i32) -> mat3:
@@ -368,10 +356,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Return the dynamic viscosity of a liquid, or the damping of a solid."""
         matter = self.matter[s, p]
         kind = matter[0]
-        is_snow = kind == SNOW
-        is_liquid = kind == LIQUID
-        damping = ti.select(is_snow, 0.0, self.solid_viscosity)
-        return ti.select(is_liquid, self.liquid_viscosity, damping)
+        damping = ti.select(kind == SNOW, 0.0, self.solid_viscosity)
+        return ti.select(kind == LIQUID, self.liquid_viscosity, damping)
 
     @ti.func
     def stress(self, s: i32, p: i32, solid: Template) -> None:
@@ -403,22 +389,16 @@ class ParticleStress3D(FreeSurfaceKernels):
             for row in ti.static(_AXES):
                 slope = c[row, column]
                 mirrored_slope = c[column, row]
-                shear_rate = slope + mirrored_slope
-                tau = viscosity * shear_rate
+                tau = viscosity * (slope + mirrored_slope)
                 if ti.static(row == column):
                     normal_stress = diagonal[row]
                     tau = tau + normal_stress
                 elif ti.static(solid):
                     shear_stress = off_diagonal[3 - row - column]
                     tau = tau + shear_stress
-                speed_per_cell = self.dx * slope
-                gain_per_cell = self.stress_factor * tau
-                a[row] = speed_per_cell - gain_per_cell
-            cell_speed = ti.abs(a.xyz)
-            reached_speed = 1.5 * cell_speed
-            affine_speed = affine_speed + reached_speed
-            momentum_slope = self.velocity_scale * a
-            self.momentum_slopes[column][s, p] = momentum_slope
+                a[row] = self.dx * slope - self.stress_factor * tau
+            affine_speed = affine_speed + 1.5 * ti.abs(a.xyz)
+            self.momentum_slopes[column][s, p] = self.velocity_scale * a
         self.keep_node_speed(s, p, affine_speed)
 
     @ti.func
@@ -426,8 +406,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Keep the largest speed that a particle gives to a node in this advance."""
         particle_state = self.particle_state[s, p]
         velocity = particle_state.xyz
-        speed = ti.abs(velocity)
-        node_speed = speed + affine_speed
+        node_speed = ti.abs(velocity) + affine_speed
         extremes = self.extremes[s, p]
         largest = extremes[3]
         for axis in ti.static(_AXES):
@@ -457,13 +436,9 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.count_scale,
         )
         particle_state = self.particle_state[s, p]
-        at_particle = scale * particle_state
-        way_x = place.x * step_x
-        way_y = place.y * step_y
-        way_z = place.z * step_z
-        at_middle = at_particle - way_x
-        at_middle = at_middle - way_y
-        at_middle = at_middle - way_z
+        at_middle = scale * particle_state - place.x * step_x
+        at_middle = at_middle - place.y * step_y
+        at_middle = at_middle - place.z * step_z
 
         weight_x = self.weight_x[s, p]
         weight_y = self.weight_y[s, p]
@@ -471,8 +446,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         for i, j in ti.static(_ROWS):
             weight_i = weight_x[i]
             weight_j = weight_y[j]
-            across = weight_i * weight_j
-            weights = across * weight_z
+            weights = weight_i * weight_j * weight_z
             at_column = stepped(at_middle, step_x, i - 1)
             at_row = stepped(at_column, step_y, j - 1)
             start = self.row_start(lowest, i, j)
@@ -545,13 +519,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         new_velocity = velocity
         if self.is_outward(index, normal):
             impact_speed = ti.abs(normal)
-            first_square = first * first
-            second_square = second * second
-            sliding_square = first_square + second_square
-            sliding_speed = ti.sqrt(sliding_square)
+            sliding_speed = ti.sqrt(first * first + second * second)
             divisor = larger(sliding_speed, 1e-9)
-            lost_speed = friction * impact_speed
-            loss = lost_speed / divisor
+            loss = friction * impact_speed / divisor
             kept = larger(1.0 - loss, 0.0)
             new_first = first * kept
             new_second = second * kept
@@ -606,18 +576,15 @@ class ParticleStress3D(FreeSurfaceKernels):
             weight_j = weight_y[j]
             across = weight_i * weight_j
             start = self.row_start(lowest, i, j)
-            node_x = i - 1.0
-            node_y = j - 1.0
-            distance_x = node_x - place.x
-            distance_y = node_y - place.y
+            distance_x = i - 1.0 - place.x
+            distance_y = j - 1.0 - place.y
             for k in ti.static(_NODES):
                 weight_k = weight_z[k]
                 weight = across * weight_k
                 node = start + k
                 node_state = self.node_state[s, node]
                 share = weight * node_state
-                node_z = k - 1.0
-                distance_z = node_z - place.z
+                distance_z = k - 1.0 - place.z
                 state += share
                 for entry in ti.static(_SLOPED):
                     component = share[entry]
@@ -628,12 +595,10 @@ class ParticleStress3D(FreeSurfaceKernels):
                     moment = distance_y * component
                     moments_xy[4 + entry] += moment
                 sloped_share = share[:4]
-                moment_z = distance_z * sloped_share
-                moments_z += moment_z
+                moments_z += distance_z * sloped_share
         slope_factor = 4.0 * self.inv_dx
-        slopes_xy = slope_factor * moments_xy
         slope_z = slope_factor * moments_z
-        self.grid_slopes[s, p] = slopes_xy
+        self.grid_slopes[s, p] = slope_factor * moments_xy
         self.slope_z[s, p] = slope_z
         self.grid_state[s, p] = state
 
@@ -649,8 +614,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         grid_density = grid_state[4]
         old_position = self.x[s, p]
         old_x = old_position.xyz
-        step = self.dt * velocity
-        x = old_x + step
+        x = old_x + self.dt * velocity
         low = self.position_min
         high = self.position_max
         x = bounded(x, low, high)
@@ -702,8 +666,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         matter = self.matter[s, p]
         old_min = matter[2]
         old_max = matter[3]
-        is_smaller = ratio < old_min
-        new_min = ti.select(is_smaller, ratio, old_min)
+        new_min = ti.select(ratio < old_min, ratio, old_min)
         new_max = larger(ratio, old_max)
         matter[1] = ratio
         matter[2] = new_min
@@ -719,8 +682,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         f = self.deformation(s, p)
         rows = rows_of(f)
         solid_jacobian = determinant(rows)
-        is_liquid = kind == LIQUID
-        return ti.select(is_liquid, ratio, solid_jacobian)
+        return ti.select(kind == LIQUID, ratio, solid_jacobian)
 
     @ti.func
     def keep_jacobian(self, s: i32, p: i32, jacobian: f32) -> None:
@@ -728,8 +690,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         extremes = self.extremes[s, p]
         old_min = extremes[1]
         old_max = extremes[2]
-        is_smaller = jacobian < old_min
-        new_min = ti.select(is_smaller, jacobian, old_min)
+        new_min = ti.select(jacobian < old_min, jacobian, old_min)
         new_max = larger(jacobian, old_max)
         extremes[1] = new_min
         extremes[2] = new_max
@@ -789,15 +750,13 @@ class ParticleStress3D(FreeSurfaceKernels):
         high = self.yield_high
         trial = load_rows(self.listed_gradient, block)
         rows, growth = plastic_return(trial, low, high)
-        first = block * _LANES
-        snow_lanes = snow_count - first
+        snow_lanes = snow_count - block * _LANES
         for lane in ti.static(_LANE_NUMBERS):
             is_snow = lane < snow_lanes
             for row, column in ti.static(_PLACES):
                 elastic = rows[row][column][lane]
                 old = trial[row][column][lane]
-                kept = ti.select(is_snow, elastic, old)
-                rows[row][column][lane] = kept
+                rows[row][column][lane] = ti.select(is_snow, elastic, old)
         store_rows(self.listed_gradient, block, rows)
         store_lanes(self.listed_growth, block, growth)
 
@@ -981,8 +940,7 @@ def load_lanes(field: Template, block: i32) -> Value:
     first = block * _LANES
     values = ti.Vector.zero(f32, _LANES)
     for lane in ti.static(_LANE_NUMBERS):
-        number = first + lane
-        value = field[number]
+        value = field[first + lane]
         values[lane] = value
     return values
 
@@ -1035,9 +993,7 @@ def store_lanes(field: Template, block: i32, values: Value) -> None:
 @ti.func
 def block_count(count: i32) -> i32:
     """Return how many blocks hold the particles of a list; the last may have gaps."""
-    last_lane = _LANES - 1
-    filled_up = count + last_lane
-    return filled_up // _LANES
+    return (count + (_LANES - 1)) // _LANES
 
 
 @ti.func

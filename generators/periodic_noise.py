@@ -64,9 +64,7 @@ class Smooth:
         f = self.value[:, None]
         g = other.value[:, None]
         value = self.value * other.value
-        f_slope = g * self.gradient
-        g_slope = f * other.gradient
-        gradient = f_slope + g_slope
+        gradient = g * self.gradient + f * other.gradient
         # f'_i g'_j and its transpose, shape [point, axis, axis]
         f_column = self.gradient[:, :, None]
         g_row = other.gradient[:, None, :]
@@ -75,17 +73,13 @@ class Smooth:
         both_crossed = crossed + transposed
         f_factor = f[..., None]
         g_factor = g[..., None]
-        f_curved = g_factor * self.hessian
-        g_curved = f_factor * other.hessian
-        both_curved = f_curved + g_curved
-        hessian = both_curved + both_crossed
+        hessian = g_factor * self.hessian + f_factor * other.hessian + both_crossed
         return Smooth(value, gradient, hessian)
 
     def scale(self, factor: Array | float) -> Smooth:
         """Multiply by numbers that do not depend on the point's coordinates."""
         shape = self.value.shape
-        exact = np.asarray(factor, np.float64)
-        factors = np.broadcast_to(exact, shape)
+        factors = np.broadcast_to(np.asarray(factor, np.float64), shape)
         of_gradient = factors[:, None]
         of_hessian = factors[:, None, None]
         value = factors * self.value
@@ -127,9 +121,7 @@ class Flow:
     def speed_rms(self) -> float:
         """Root mean square of the speed over the points [length/s]."""
         square_sum = _square_sum(self.velocity)
-        point_count = len(self.velocity)
-        mean_square = square_sum / point_count
-        return math.sqrt(mean_square)
+        return math.sqrt(square_sum / len(self.velocity))
 
 
 def _square_sum(values: Array) -> float:
@@ -169,13 +161,10 @@ def draw_direction(rng: RandomSource, dimension: int) -> Array:
     # until a point of the cube lies in the unit ball, and not at its very centre
     while True:
         unit = rng.random(shape)
-        doubled = 2.0 * unit
-        vector = doubled - 1.0
+        vector = 2.0 * unit - 1.0
         square = _square_sum(vector)
         if 2.0**-20 <= square <= 1.0:
-            length = math.sqrt(square)
-            direction = vector / length
-            return np.asarray(direction)
+            return np.asarray(vector / math.sqrt(square))
 
 
 def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
@@ -213,10 +202,8 @@ def noise(position: Array, lattice: Array) -> Smooth:
     per_length = float(frequency)
     point_count, dimension = position.shape
     scaled = position * per_length
-    low_corner = np.floor(scaled)
-    cell = low_corner.astype(np.int64)
-    last_cell = frequency - 1
-    cell = np.minimum(cell, last_cell)
+    cell = np.floor(scaled).astype(np.int64)
+    cell = np.minimum(cell, frequency - 1)
     # distances from the low corner of the cell, and the weights of the two corners
     along = []
     weights = []
@@ -234,8 +221,7 @@ def noise(position: Array, lattice: Array) -> Smooth:
 
     total = constant(0.0, point_count, dimension)
     for corner in itertools.product((0, 1), repeat=dimension):
-        steps = np.array(corner)
-        unwrapped_node = cell + steps
+        unwrapped_node = cell + np.array(corner)
         node = unwrapped_node % frequency  # shape [point, axis]
         node_of_axis = tuple(node.T)
         gradient = lattice[node_of_axis]
@@ -253,9 +239,8 @@ def noise(position: Array, lattice: Array) -> Smooth:
         total = total + term
 
     # from derivatives per cell of the lattice to derivatives per length
-    per_square = per_length * per_length
     gradient = total.gradient * per_length
-    hessian = total.hessian * per_square
+    hessian = total.hessian * (per_length * per_length)
     return Smooth(total.value, gradient, hessian)
 
 
@@ -265,9 +250,7 @@ def wrapped_offset(position: Array, centre: Array) -> Array:
     Each component lies in [-1/2, 1/2]: the nearest image of the centre counts.
     """
     way = position - centre
-    periods = np.rint(way)
-    nearest = way - periods
-    return np.asarray(nearest)
+    return np.asarray(way - np.rint(way))
 
 
 def rotated_gradient(psi: Smooth) -> Flow:
@@ -341,8 +324,7 @@ def fill_box(
     """
     dimension = len(counts)
     indices = np.indices(tuple(counts))
-    cell_by_axis = indices.reshape(dimension, -1)
-    cell = cell_by_axis.T
+    cell = indices.reshape(dimension, -1).T
     centred = draw_offsets(rng, cell.shape, subdivision=subdivision)
     displacement = centred * jitter
     middle = cell + 0.5
@@ -350,8 +332,5 @@ def fill_box(
     spacings = np.asarray(counts)
     share = place / spacings  # of the extent
     start = np.asarray(low, np.float64)
-    end = np.asarray(high, np.float64)
-    extent = end - start
-    way = extent * share
-    position = start + way
+    position = start + (np.asarray(high, np.float64) - start) * share
     return quantise(position)

@@ -50,13 +50,11 @@ def measured_values(manifest: Manifest) -> Measured:
     dataset_hash = manifest.dataset_sha256
     if not manifest.complete or dataset_hash is None or not all(limits):
         raise DataError(
-            "the data set is incomplete",
+            f"the data set is incomplete: got {len(manifest.files)} scenarios; "
+            f"perturbed runs of {sum(bool(limit) for limit in limits)} of test, "
+            "expected all scenarios of train, valid and test, and perturbed runs of "
+            f"test; lagbench generate --split {manifest.split} --size {manifest.size}",
             where=f"{manifest.split} {manifest.size}",
-            expected="all scenarios of train, valid and test, and perturbed runs of "
-            "test",
-            got=f"{len(manifest.files)} scenarios; perturbed runs of "
-            f"{sum(bool(limit) for limit in limits)} of test",
-            fix=f"lagbench generate --split {manifest.split} --size {manifest.size}",
         )
     hashes: dict[int, str] = {}
     for entry in manifest.files:
@@ -167,11 +165,10 @@ def record(
         old_hash = size.measured.dataset_sha256
     if old_hash not in (None, values.dataset_sha256) and not allow:
         raise DataError(
-            "the bits changed and MAJOR did not",
+            f"the bits changed and MAJOR did not: got {values.dataset_sha256}, "
+            f"expected {old_hash}; raise MAJOR of the split, or pass --allow-change "
+            "before a release",
             where=f"{registry}, {size.split} {size.name} {size.version}",
-            expected=old_hash,
-            got=values.dataset_sha256,
-            fix="raise MAJOR of the split, or pass --allow-change before a release",
         )
 
     if old_hash == values.dataset_sha256 and size.measured is not None:
@@ -240,11 +237,9 @@ def _checked_manifest(size: Size, root: Path) -> Manifest:
     manifest = read_manifest(root, size.split, size.name, size.major)
     if manifest is None:
         raise DataError(
-            "the data set has no manifest",
+            "the data set has no manifest: got none, expected a manifest of generated "
+            "data; generate it first: lagbench generate",
             where=str(folder),
-            expected="a manifest of generated data",
-            got="none",
-            fix="generate it first: lagbench generate",
         )
 
     train_paths = []
@@ -253,11 +248,10 @@ def _checked_manifest(size: Size, root: Path) -> Manifest:
         if not path.is_file() or file_sha256(path) != entry.file_sha256:
             options = f"--split {manifest.split} --size {manifest.size}"
             raise DataError(
-                "a file is not the one that the manifest describes",
+                "a file is not the one that the manifest describes: got another file, "
+                "or none, expected the file of the manifest; lagbench generate "
+                f"{options}",
                 where=str(path),
-                expected="the file of the manifest",
-                got="another file, or none",
-                fix=f"lagbench generate {options}",
             )
         if entry.subset == "train":
             train_paths.append(path)

@@ -95,8 +95,7 @@ def recorded_particles(coarse: InitialState, fine: InitialState) -> NDArray[np.i
         _, nearest = cKDTree(points[particles]).query(places[rows], k=count)
         candidates = particles[np.sort(nearest.reshape(len(rows), count), axis=1)]
         way = points[candidates] - places[rows][:, None]
-        square = (way * way).sum(axis=-1)
-        order = np.argsort(square, axis=1, kind="stable")
+        order = np.argsort((way * way).sum(axis=-1), axis=1, kind="stable")
         by_distance = np.take_along_axis(candidates, order, axis=1)
         is_taken = np.zeros(len(points), np.bool_)
         for row, choices in zip(rows.tolist(), by_distance, strict=True):

@@ -100,17 +100,12 @@ class Rectangle:
         c, s = self.axis
         x, y = position.T
         # distances beyond the ends and beyond the sides, negative between them
-        from_middle_along = np.abs(c * x + s * y)
-        from_middle_across = np.abs(c * y - s * x)
-        along = from_middle_along - 0.5 * self.length
-        across = from_middle_across - 0.5 * self.width
-        farther = np.maximum(along, across)
-        inside = np.minimum(farther, 0.0)
+        along = np.abs(c * x + s * y) - 0.5 * self.length
+        across = np.abs(c * y - s * x) - 0.5 * self.width
+        inside = np.minimum(np.maximum(along, across), 0.0)
         along = np.maximum(along, 0.0)
         across = np.maximum(across, 0.0)
-        square_outside = along * along + across * across
-        outside = np.sqrt(square_outside)
-        return np.asarray(outside + inside)
+        return np.asarray(np.sqrt(along * along + across * across) + inside)
 
 
 @dataclass(frozen=True)
@@ -138,9 +133,7 @@ class Disc:
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y = position.T
-        square = x * x + y * y
-        from_centre = np.sqrt(square)
-        return np.asarray(from_centre - self.radius)
+        return np.asarray(np.sqrt(x * x + y * y) - self.radius)
 
 
 @dataclass(frozen=True)
@@ -165,25 +158,19 @@ class Blobs:
         """
         low = offsets.min(axis=0) - 1.0
         high = offsets.max(axis=0) + 1.0
-        middle_of_box = 0.5 * (low + high)
-        centres = offsets - middle_of_box
+        centres = offsets - 0.5 * (low + high)
         width, height = high - low
         # middles of the cells from the centre, as shares of the box
-        middle_in_cells = np.arange(cells) + 0.5
-        middle = middle_in_cells / cells - 0.5
-        cell_x = middle * width
-        cell_y = middle * height
-        x, y = np.meshgrid(cell_x, cell_y)
+        middle = (np.arange(cells) + 0.5) / cells - 0.5
+        x, y = np.meshgrid(middle * width, middle * height)
         cell_count = cells * cells
         is_covered = np.zeros((cells, cells), dtype=np.bool_)
         for centre_x, centre_y in centres:
             dx = x - centre_x
             dy = y - centre_y
-            square = dx * dx + dy * dy
-            is_covered |= square <= 1.0
+            is_covered |= dx * dx + dy * dy <= 1.0
         box_area = width * height
-        covered_count = np.count_nonzero(is_covered)
-        unit_area = float(covered_count * box_area) / cell_count
+        unit_area = float(np.count_nonzero(is_covered) * box_area) / cell_count
         scale = math.sqrt(area / unit_area)
         scaled = []
         for centre_x, centre_y in centres.tolist():
@@ -238,11 +225,10 @@ def check_room(shape: Shape, region: Region) -> None:
         extent = 2.0 * reach
         if room < extent:
             raise WorkFailedError(
-                "a body does not fit between the walls",
+                f"a body does not fit between the walls: got {extent:.4f}, expected "
+                f"extent up to {room:.4f}; lower the areas or lengths in the file of "
+                "the split",
                 where=f"{type(shape).__name__} between {low:.4f} and {high:.4f}",
-                expected=f"extent up to {room:.4f}",
-                got=f"{extent:.4f}",
-                fix="lower the areas or lengths in the file of the split",
             )
 
 
@@ -269,12 +255,10 @@ def _check_share(shape: Shape, volume: float) -> None:
     is_thick_enough = min(shape.reach) > 0.0 and shape.measure > least > 0.0
     if not is_thick_enough:
         raise WorkFailedError(
-            "a body is too thin to hold particles",
+            f"a body is too thin to hold particles: got {shape.measure:g} of "
+            f"{volume:g}, expected an area or volume above {LEAST_SHARE:g} of the "
+            "square or cube around the body; correct the lengths of the shape",
             where=type(shape).__name__,
-            expected=f"an area or volume above {LEAST_SHARE:g} of the square or cube "
-            "around the body",
-            got=f"{shape.measure:g} of {volume:g}",
-            fix="correct the lengths of the shape",
         )
 
 
@@ -308,8 +292,7 @@ def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
     missing_count = count
     start = 1
     while missing_count > 0:
-        end = start + block_size
-        index = np.arange(start, end, dtype=np.float64)
+        index = np.arange(start, start + block_size, dtype=np.float64)
         turns = shift + index[:, None] * steps
         place = turns - np.floor(turns)  # in the unit square or cube
         local = (place - 0.5) * side

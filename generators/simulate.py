@@ -227,8 +227,7 @@ def _kinetic_energy(velocity: Singles, mass: float) -> float:
     components = velocity.astype(np.float64).ravel()
     squares = components * components
     # An exact sum: which frames are active enters the content hash.
-    square_sum = math.fsum(squares.tolist())
-    return 0.5 * mass * square_sum
+    return 0.5 * mass * math.fsum(squares.tolist())
 
 
 def _diagnose(
@@ -264,10 +263,7 @@ def draw_perturbation(size: Size, scenario: int, particles: int) -> Singles:
     rng = np.random.Generator(np.random.PCG64(seed))
     shape = (particles, size.box.dimension)
     draws = rng.random(shape)
-    is_negative = draws < 0.5
-    signs = np.where(is_negative, -1.0, 1.0)
-    displacement = QUANTUM * signs
-    return displacement.astype(np.float32)
+    return (QUANTUM * np.where(draws < 0.5, -1.0, 1.0)).astype(np.float32)
 
 
 def measure_predictability(
@@ -289,8 +285,7 @@ def measure_predictability(
     batch = ScenarioBatch(job, report, frames=frame_counts)
     # displacements of the batch [length], shape [scenario, particle, axis]
     positions = [state.position for state in batch.states]
-    shape = np.shape(positions)
-    offsets = np.zeros(shape, dtype=np.float32)
+    offsets = np.zeros(np.shape(positions), dtype=np.float32)
     limits: list[list[float]] = [[] for _ in frame_counts]
     with ExitStack() as stack:
         truths = []
@@ -320,7 +315,4 @@ def _root_mean_square_error(position: Singles, truth: Singles, box: Box) -> floa
     exact_truth = truth.astype(np.float64)
     exact_position = position.astype(np.float64)
     error = box.displacement(exact_truth, exact_position)
-    squares = error * error
-    square_sum = math.fsum(squares.ravel().tolist())
-    mean_square = square_sum / error.size
-    return math.sqrt(mean_square)
+    return math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)

@@ -38,8 +38,7 @@ class Ball:
     @classmethod
     def of_volume(cls, volume: float) -> Ball:
         """Return the ball that fills this volume [length^3]."""
-        unit_volume = 4.0 / 3.0 * math.pi
-        radius_cubed = volume / unit_volume
+        radius_cubed = volume / (4.0 / 3.0 * math.pi)
         radius = cube_root(radius_cubed)
         return cls(radius)
 
@@ -47,8 +46,7 @@ class Ball:
     def measure(self) -> float:
         """Four thirds of pi times the radius cubed."""
         r = self.radius
-        unit_volume = 4.0 / 3.0 * math.pi
-        return unit_volume * r * r * r
+        return 4.0 / 3.0 * math.pi * r * r * r
 
     @property
     def reach(self) -> tuple[float, float, float]:
@@ -58,10 +56,8 @@ class Ball:
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y, z = position.T
-        square = x * x + y * y + z * z
-        from_centre = np.sqrt(square)
-        distance = from_centre - self.radius
-        return np.asarray(distance)
+        from_centre = np.sqrt(x * x + y * y + z * z)
+        return np.asarray(from_centre - self.radius)
 
 
 @dataclass(frozen=True)
@@ -76,8 +72,7 @@ class Block:
         its height [1].
         """
         along_x, along_z = aspects
-        relative_area = along_x * along_z
-        height_cubed = volume / relative_area
+        height_cubed = volume / (along_x * along_z)
         height = cube_root(height_cubed)
         width = along_x * height
         depth = along_z * height
@@ -100,17 +95,11 @@ class Block:
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
-        reach = np.array(self.reach)
-        from_middle = np.abs(position)
-        beyond = from_middle - reach
-        nearest_face = beyond.max(axis=1)
-        inside = np.minimum(nearest_face, 0.0)
-        way_outside = np.maximum(beyond, 0.0)
-        x, y, z = way_outside.T
-        square = x * x + y * y + z * z
-        outside = np.sqrt(square)
-        distance = outside + inside
-        return np.asarray(distance)
+        beyond = np.abs(position) - np.array(self.reach)
+        inside = np.minimum(beyond.max(axis=1), 0.0)
+        x, y, z = np.maximum(beyond, 0.0).T
+        outside = np.sqrt(x * x + y * y + z * z)
+        return np.asarray(outside + inside)
 
 
 @dataclass(frozen=True)
@@ -125,8 +114,7 @@ class Rod:
     def measure(self) -> float:
         """Pi times the radius squared times the length."""
         r = self.radius
-        cross_section = math.pi * r * r
-        return cross_section * self.length
+        return math.pi * r * r * self.length
 
     @property
     def reach(self) -> tuple[float, float, float]:
@@ -138,38 +126,25 @@ class Rod:
         return reach_x, reach_y, reach_z
 
     def _reach_along(self, component: float) -> float:
-        square_cosine = component * component
-        square_sine = 1.0 - square_cosine
+        square_sine = 1.0 - component * component
         square_sine = max(0.0, square_sine)
         sine = math.sqrt(square_sine)
-        half_length = 0.5 * self.length
-        reach_of_axis = half_length * abs(component)
-        reach_of_disc = self.radius * sine
-        return reach_of_axis + reach_of_disc
+        return 0.5 * self.length * abs(component) + self.radius * sine
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y, z = position.T
         a, b, c = self.axis
         height = a * x + b * y + c * z
-        square_from_centre = x * x + y * y + z * z
-        square_height = height * height
-        square = square_from_centre - square_height
+        square = x * x + y * y + z * z - height * height
         square = np.maximum(square, 0.0)
         # distances beyond the ends and beyond the side, negative between them
-        half_length = 0.5 * self.length
-        from_middle = np.abs(height)
-        along = from_middle - half_length
-        from_axis = np.sqrt(square)
-        across = from_axis - self.radius
-        farther = np.maximum(along, across)
-        inside = np.minimum(farther, 0.0)
+        along = np.abs(height) - 0.5 * self.length
+        across = np.sqrt(square) - self.radius
+        inside = np.minimum(np.maximum(along, across), 0.0)
         along = np.maximum(along, 0.0)
         across = np.maximum(across, 0.0)
-        square_outside = along * along + across * across
-        outside = np.sqrt(square_outside)
-        distance = outside + inside
-        return np.asarray(distance)
+        return np.asarray(np.sqrt(along * along + across * across) + inside)
 
 
 def cube_root(value: float) -> float:
@@ -183,10 +158,7 @@ def cube_root(value: float) -> float:
     """
     root = max(1.0, value)
     while True:
-        cube = root * root * root
-        excess = cube - value
-        slope = 3.0 * root * root
-        smaller = root - excess / slope
+        smaller = root - (root * root * root - value) / (3.0 * root * root)
         if not smaller < root:
             return root
         root = smaller

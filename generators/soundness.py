@@ -67,19 +67,13 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     }
     speeds = {}
     for material, modulus in moduli.items():
-        square_speed = modulus / p.density
-        speeds[material] = math.sqrt(square_speed)
+        speeds[material] = math.sqrt(modulus / p.density)
     return speeds
 
 
 def wave_modulus(young: float, poisson: float) -> float:
     """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)), in the unit of E."""
-    lateral = 1.0 + poisson
-    twice_poisson = 2.0 * poisson
-    incompressibility = 1.0 - twice_poisson
-    divisor = lateral * incompressibility
-    axial = 1.0 - poisson
-    return young * axial / divisor
+    return young * (1.0 - poisson) / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
 
 
 class SoundnessRecorder:
@@ -113,12 +107,9 @@ class SoundnessRecorder:
             velocity: particle velocities [length/s], shape [particle, axis].
             ratio: J of liquid [1], shape [particle]; of others it is not read.
         """
-        squares = np.square(velocity, dtype=np.float64)
-        square_speed = squares.sum(axis=-1)
-        speed = np.sqrt(square_speed)
+        speed = np.sqrt(np.square(velocity, dtype=np.float64).sum(axis=-1))
         mach = speed / self._sound_speed
-        frame_max = float(mach.max())
-        self._mach_max = max(self._mach_max, frame_max)
+        self._mach_max = max(self._mach_max, float(mach.max()))
         mach_counts = _count_bins(mach)
         self._mach_counts += mach_counts
 
@@ -160,43 +151,29 @@ class SoundnessRecorder:
         """Return how many particles reached a numerical bound at any substep."""
         p = self._parameters
         # Exponents xi (1 - Jp) are compared, because exp may overflow.
-        exact_least = least.astype(np.float64)
-        exact_greatest = greatest.astype(np.float64)
-        most_compaction = 1.0 - exact_least
-        least_compaction = 1.0 - exact_greatest
-        largest_exponent = p.snow_hardening * most_compaction
-        smallest_exponent = p.snow_hardening * least_compaction
-        exponent_max = math.log(p.snow_hardening_max)
-        exponent_min = math.log(p.snow_hardening_min)
-        is_hard = largest_exponent >= exponent_max
-        is_soft = smallest_exponent <= exponent_min
-        jp_min = np.float32(p.snow_jp_min)
-        is_dense = least <= jp_min
-        is_at_snow_bound = is_dense | is_hard | is_soft
+        largest_exponent = p.snow_hardening * (1.0 - least.astype(np.float64))
+        smallest_exponent = p.snow_hardening * (1.0 - greatest.astype(np.float64))
+        is_hard = largest_exponent >= math.log(p.snow_hardening_max)
+        is_soft = smallest_exponent <= math.log(p.snow_hardening_min)
+        is_at_snow_bound = (least <= np.float32(p.snow_jp_min)) | is_hard | is_soft
         is_clamped_snow = self._is_snow & is_at_snow_bound
 
-        jacobian_min = np.float32(p.jacobian_min)
-        is_compressed = least <= jacobian_min
-        is_clamped_liquid = self._is_liquid & is_compressed
-        is_clamped = is_clamped_liquid | is_clamped_snow
-        return int(np.count_nonzero(is_clamped))
+        is_clamped_liquid = self._is_liquid & (least <= np.float32(p.jacobian_min))
+        return int(np.count_nonzero(is_clamped_liquid | is_clamped_snow))
 
 
 def _count_bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return how many values lie in each bin; the last one holds all that is beyond."""
-    last_bin = _BIN_COUNT - 1
     place = values / BIN
-    place = np.minimum(place, last_bin)
-    index = place.astype(np.int64)
-    return np.bincount(index, minlength=_BIN_COUNT)
+    place = np.minimum(place, _BIN_COUNT - 1)
+    return np.bincount(place.astype(np.int64), minlength=_BIN_COUNT)
 
 
 def _quantile(counts: NDArray[np.int64], share: float) -> float:
     """Return the end of the first bin up to which a share of the values lies."""
     cumulative = np.cumsum(counts)
     total = cumulative[-1]
-    count_below = share * total
-    first_bin = np.searchsorted(cumulative, count_below)
+    first_bin = np.searchsorted(cumulative, share * total)
     end = int(first_bin) + 1  # [bins]
     return end * BIN
 

@@ -59,8 +59,7 @@ def fixed_point_scale(particles: int, bound: float) -> float:
     is_power_of_two = mantissa == 0.5
     if is_power_of_two:
         exponent -= 1
-    power = bits - exponent
-    return math.ldexp(1.0, power)
+    return math.ldexp(1.0, bits - exponent)
 
 
 @ti.func
@@ -72,12 +71,9 @@ def spline_weights(f: Value) -> Value:
     to_low = 1.5 - f
     to_mid = f - 1.0
     to_high = f - 0.5
-    low_square = to_low * to_low
-    mid_square = to_mid * to_mid
-    high_square = to_high * to_high
-    low = 0.5 * low_square
-    mid = 0.75 - mid_square
-    high = 0.5 * high_square
+    low = 0.5 * (to_low * to_low)
+    mid = 0.75 - to_mid * to_mid
+    high = 0.5 * (to_high * to_high)
     return low, mid, high
 
 
@@ -90,14 +86,11 @@ def stencil(x: vec4, inv_dx: f32, width: i32) -> Value:
     """
     position = x.xy
     scaled = position * inv_dx
-    shifted_place = scaled - 0.5
-    base = ti.cast(shifted_place, i32)
+    base = ti.cast(scaled - 0.5, i32)
     base_place = ti.cast(base, f32)  # [cells]
     f = scaled - base_place
     offset = f - 1.0
-    column = base.x * width
-    node = column + base.y
-    node_bits = ti.bit_cast(node, f32)
+    node_bits = ti.bit_cast(base.x * width + base.y, f32)
 
     low, mid, high = spline_weights(f)
     low_y = low.y
@@ -151,9 +144,7 @@ def masked(number: i32, node_count: Template) -> Value:
     one.
     """
     bit_count = ti.static(node_count.bit_length())
-    end = ti.static(1 << bit_count)
-    mask = ti.static(end - 1)
-    return number & mask
+    return number & ti.static(ti.static(1 << bit_count) - 1)
 
 
 @ti.func
@@ -171,17 +162,13 @@ def to_fixed(scaled: Value) -> Value:
 @ti.func
 def shifted(scaled: Value) -> Value:
     """Return :func:`to_fixed` plus the bits of the shift."""
-    rounding_shift = ti.cast(_ROUNDING_SHIFT, f64)
-    exact = ti.cast(scaled, f64)
-    moved = exact + rounding_shift
-    return ti.bit_cast(moved, i64)
+    return ti.bit_cast(ti.cast(scaled, f64) + ti.cast(_ROUNDING_SHIFT, f64), i64)
 
 
 @ti.func
 def from_fixed(total: Value, inverse_scale: f32) -> Value:
     """Return a sum of :func:`to_fixed` as float32, rounded once."""
-    rounded = ti.cast(total, f32)
-    return rounded * inverse_scale
+    return ti.cast(total, f32) * inverse_scale
 
 
 @ti.func
@@ -245,8 +232,7 @@ def row_count(rows: Template, s: i32, n: i32) -> Value:
     first_weights = first[0]
     second_weights = second[1]
     third_weights = third[2]
-    shifted_count = first_weights + second_weights + third_weights
-    count = shifted_count - shifts
+    count = first_weights + second_weights + third_weights - shifts
     return count, shifts
 
 
@@ -264,14 +250,11 @@ def stepped(value: Value, step: Value, count: Template) -> Value:
 @ti.func
 def bounded(value: Value, low: f32, high: f32) -> Value:
     """Return the value kept in [low, high]; NaN becomes low."""
-    is_above = value > low
-    raised = ti.select(is_above, value, low)
-    is_below = raised < high
-    return ti.select(is_below, raised, high)
+    raised = ti.select(value > low, value, low)
+    return ti.select(raised < high, raised, high)
 
 
 @ti.func
 def largest(value: Value, so_far: Value) -> Value:
     """Return the larger one; a value that is NaN wins, so that it is seen."""
-    is_no_larger = value <= so_far
-    return ti.select(is_no_larger, so_far, value)
+    return ti.select(value <= so_far, so_far, value)

@@ -459,12 +459,13 @@ def predict(
                 where=f"predict, {tier.split} {tier.name}, scenario {scenario}",
             )
         # The forcing is given for all frames, unlike the positions.
-        _, wall_velocity = data.store.material_and_walls(scenario)
+        opened = data.store.open(scenario)
+        wall_velocity = opened.wall_velocity
         forcing = None
         if wall_velocity is not None:
             forcing = torch.from_numpy(wall_velocity.copy())
         window = data[first]._replace(wall_velocity=forcing)
-        body_force = data.store.body_force(scenario)
+        body_force = opened.body_force
         if body_force is not None:
             window = window._replace(body_force=torch.from_numpy(body_force.copy()))
         given = collate([window]).part(visible_frames).to(device)

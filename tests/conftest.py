@@ -9,8 +9,8 @@ import pickle
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,8 +39,7 @@ from lagbench.scoring import score as scorer
 from lagbench.scoring.score import ScenarioScores
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission.format import FileInfo
-from lagbench.work.pool import Pool
-from lagbench.work.run import ONE_THREAD, Meter
+from lagbench.work.run import Meter
 
 if TYPE_CHECKING:
     from model_board import ModelBoard
@@ -72,7 +71,6 @@ SIZE = "tiny"
 # The parts that session fixtures exchange below, as they ship.
 SCORE_SCENARIOS = scorer.score_scenarios
 PAINT_PICTURES = cards.paint_pictures
-POOL_USERS = ("lagbench.make.generate.Pool", "lagbench.make.verify.Pool")
 SCENARIO_SCORER = "lagbench.scoring.score.score_scenarios"
 PICTURE_PAINTER = "lagbench.make.cards.paint_pictures"
 
@@ -134,41 +132,6 @@ def pytest_sessionfinish() -> None:
         # The bytecode of modules in temporary folders is never read again.
         temporary_modules = sys.pycache_prefix + tempfile.gettempdir()
         shutil.rmtree(temporary_modules, ignore_errors=True)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def lasting_workers() -> Iterator[None]:
-    """Simulate in one worker that outlives a generation.
-
-    For speed: Taichi takes seconds to start in every new worker. A pool that a failed
-    generation leaves at work is closed. Generations that are killed or counted are
-    started by their tests as processes of their own.
-    """
-    pools: dict[object, Pool] = {}
-
-    @contextmanager
-    def lasting_pool(
-        _size: int, _environment: Mapping[str, str] | None = None
-    ) -> Iterator[Pool]:
-        # A worker inherits these; everything else comes with its work item.
-        inherited = []
-        for name, value in sorted(os.environ.items()):
-            if name.startswith(("PYTHON", "TI_")):
-                inherited.append((name, value))
-        key = (tuple(sys.path), tuple(inherited))
-        if key not in pools:
-            pools[key] = stack.enter_context(Pool(1, ONE_THREAD))
-        pool = pools[key]
-        try:
-            yield pool
-        finally:
-            if not pool.is_idle:
-                pools.pop(key).close()
-
-    with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        for name in POOL_USERS:
-            patch.setattr(name, lasting_pool)
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -292,10 +255,8 @@ def references_once() -> Iterator[None]:
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the exchanges above back for one test.
 
-    It gets workers, reference predictors and pictures of its own.
+    It gets reference predictors and pictures of its own.
     """
-    for name in POOL_USERS:
-        monkeypatch.setattr(name, Pool)
     monkeypatch.setattr(SCENARIO_SCORER, SCORE_SCENARIOS)
     monkeypatch.setattr(PICTURE_PAINTER, PAINT_PICTURES)
 

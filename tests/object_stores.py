@@ -45,7 +45,9 @@ def s3_server() -> Iterator[str]:
             "AWS_ENDPOINT_URL": f"http://{host}:{port}",
         }.items():
             patch.setenv(name, value)
-        fsspec.filesystem("s3", skip_instance_cache=True).mkdir(bucket)
+        # instances remember the address of an earlier server
+        fsspec.get_filesystem_class("s3").clear_instance_cache()
+        fsspec.filesystem("s3").mkdir(bucket)
         try:
             yield f"s3://{bucket}/data"
         finally:

@@ -8,8 +8,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.errors import DataError
 from lagbench.scoring.score import ScenarioJob, ScenarioScores, score_scenario
-from lagbench.work.pool import Report
+from lagbench.work.executor import Report
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,14 @@ def double(number: int, report: Report) -> int:
 
 
 def take_worker_along(number: int, report: Report) -> int:
-    """Kill the Dask worker that runs this, on every call."""
+    """Kill the worker that runs this, on every call."""
     os.kill(os.getpid(), signal.SIGKILL)
     return number
+
+
+def refuse(number: int, report: Report) -> int:
+    """Raise an error of ours."""
+    raise DataError("what is wrong; what to do", where="here")
 
 
 def time_out(number: int, report: Report) -> int:
@@ -51,12 +57,9 @@ def time_out(number: int, report: Report) -> int:
     raise TimeoutError("of the job")
 
 
-def report_for_ever(marker: Path, report: Report) -> None:
-    """Report units until that is an error, and write down its kind."""
-    try:
-        while True:
-            time.sleep(0.05)
-            report(1)
-    except Exception as error:
-        marker.write_text(type(error).__name__)
-        raise
+def sleep_long(marker: Path, report: Report) -> None:
+    """Write the worker's process id, then report for a minute."""
+    marker.write_text(str(os.getpid()))
+    for _ in range(600):
+        time.sleep(0.1)
+        report(1)

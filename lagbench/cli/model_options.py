@@ -8,14 +8,10 @@ from pathlib import Path
 from lagbench.data.layout import quote_root
 from lagbench.data.local import locate_split
 from lagbench.data.registry import NO_GENERATOR
-from lagbench.errors import WorkFailedError, check_installed
-from lagbench.work.machine import address_space_limit
+from lagbench.errors import check_installed
 
 PREDICTION_LIBRARIES = ("torch", "torch_geometric")
 TRAINING_LIBRARIES = (*PREDICTION_LIBRARIES,)
-
-NEEDED_BYTES = 1280 << 20
-"""Least address space in which a model is trained [bytes]; tiny ones map 1,040 MiB."""
 
 
 def require_libraries(names: tuple[str, ...]) -> None:
@@ -23,19 +19,9 @@ def require_libraries(names: tuple[str, ...]) -> None:
 
     Raises:
         UsageError: one of them is not installed.
-        WorkFailedError: this process may not map as much memory as they need.
     """
     for name in names:
         check_installed(name, extra="baselines")
-    # OpenBLAS, which SciPy brings, tries for ever where it finds no memory.
-    limit = address_space_limit()
-    if limit is not None and limit < NEEDED_BYTES:
-        raise WorkFailedError(
-            f"there is not enough memory: got {limit >> 20} MiB, expected at least "
-            f"{NEEDED_BYTES >> 20} MiB, for PyTorch and SciPy; raise the limit: "
-            "`ulimit -v unlimited`, or that of the batch system",
-            where="the limit on the address space of this process",
-        )
 
 
 def data_option(split: str, root: str | Path | None) -> str:

@@ -10,7 +10,7 @@ from lagbench.errors import LagbenchError, check_installed
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.solver import build
-from lagbench.work.pool import Pool, Report, WorkItem
+from lagbench.work.executor import Report, WorkItem, run_items
 
 from .output import print_warning
 
@@ -76,15 +76,15 @@ def bench_in_own_process(split: str, size: str) -> SolverBench:
     load().size(split, size)
     check_installed("taichi", extra="generate")
     item = WorkItem(
-        name=f"bench of {split} {size}",
-        function=_bench_in_worker,
-        arguments=(split, size),
+        name=f"bench of {split} {size}", function=_bench, argument=(split, size)
     )
-    with Pool(1) as pool:
-        pool.submit(item)
-        results = [event.value for event in pool.events() if event.kind == "done"]
-    result: SolverBench = results[0]
+    (finished,) = run_items([item])
+    result: SolverBench = finished.value
     return result
+
+
+def _bench(place: tuple[str, str], _: Report) -> SolverBench:
+    return bench_solver(*place)
 
 
 def try_bench(split: str, size: str, *, warning: str | None) -> SolverBench | None:
@@ -106,8 +106,3 @@ def try_bench(split: str, size: str, *, warning: str | None) -> SolverBench | No
         if warning is not None:
             print_warning(f"{warning}: {error}")
         return None
-
-
-def _bench_in_worker(split: str, size: str, report: Report) -> SolverBench:
-    """Time the solver in a worker process; there is nothing to report meanwhile."""
-    return bench_solver(split, size)

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lagbench.atomic import write_atomically
 from lagbench.errors import UnreadableFileError, UsageError, WorkFailedError
-from lagbench.work.pool import Pool, Report, WorkItem
-from lagbench.work.run import ONE_THREAD, Meter, Progress
+from lagbench.work.executor import Report, WorkItem, run_items
+from lagbench.work.run import Meter, Progress
 
 from .tasks import VERSION, load_task, task_names
 
@@ -128,19 +128,17 @@ def judge(
         done=len(done),
         unit="tasks",
     )
-    with Pool(workers, ONE_THREAD) as pool:
-        for name, values in entry.parameters.items():
-            if name not in done:
-                pool.submit(
-                    WorkItem(name=name, function=judge_task, arguments=(name, values))
-                )
-        for event in pool.events():
-            if event.kind != "done":
-                continue
-            done[event.item.name] = event.value
-            meter.count(1, scenarios=1)
-            if results is not None:
-                write_entry(entry.model_copy(update={"verdicts": done}), results)
+    items = []
+    for name, values in entry.parameters.items():
+        if name not in done:
+            items.append(
+                WorkItem(name=name, function=_judge_item, argument=(name, values))
+            )
+    for finished in run_items(items, workers=workers):
+        done[finished.item.name] = finished.value
+        meter.count(1, scenarios=1)
+        if results is not None:
+            write_entry(entry.model_copy(update={"verdicts": done}), results)
     return {name: done[name] for name in task_names() if name in done}
 
 
@@ -149,13 +147,16 @@ def write_entry(entry: DesignEntry, path: str | Path) -> None:
     write_atomically(Path(path), entry.model_dump_json(indent=1).encode() + b"\n")
 
 
-def judge_task(name: str, values: list[float], report: Report | None = None) -> Verdict:
+def _judge_item(item: tuple[str, list[float]], _: Report) -> Verdict:
+    return judge_task(*item)
+
+
+def judge_task(name: str, values: list[float]) -> Verdict:
     """Return what parameters of one task reach.
 
     Raises:
         UsageError: an unknown task, or parameters out of bounds.
     """
-    del report  # a task is one unit of work
     task = load_task(name)
     try:
         positions = task.simulate(values)

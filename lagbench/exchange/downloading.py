@@ -42,7 +42,13 @@ from lagbench.store.archive import (
     fetch_archive,
     list_releases,
 )
-from lagbench.store.copy import object_address, parse_manifest, refuse_foreign_hashes
+from lagbench.store.copy import (
+    Publication,
+    object_address,
+    parse_manifest,
+    publish,
+    refuse_foreign_hashes,
+)
 from lagbench.store.fetch import CONNECTIONS, FetchRequest, fetch_scenarios
 from lagbench.store.objects import (
     NotInStoreError,
@@ -50,7 +56,6 @@ from lagbench.store.objects import (
     check_address,
     read_object,
 )
-from lagbench.store.publication import Publication, publish
 from lagbench.work.run import Meter, Progress
 
 Reason = DataError | WorkFailedError | UsageError
@@ -157,7 +162,7 @@ def download(
         finally:
             manifest = job.write_manifest()
             if store:
-                store.put_files(manifest, at_once=True)
+                store.put_files(manifest)
         if not job.missing:
             verdict = compare_hashes(tier, manifest)
             if tier.simulated and (job.downloaded or job.forgotten):
@@ -228,7 +233,7 @@ def _describe_data(
         store.fetch(job.size.scenarios)
     cards = write_cards(job.root, job.size, split, manifest)
     if store:
-        store.finish(manifest, cards)
+        store.put_files(manifest, cards)
 
 
 def _describe_fallback(reason: Reason, scenarios: Sequence[int]) -> str:

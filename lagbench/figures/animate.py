@@ -125,7 +125,13 @@ def animate(
             numbers = track(
                 numbers, description=path.name, console=console, transient=True
             )
-        frames = draw_film(recordings, _choose_panel(kind, recordings), numbers)
+        if kind:
+            panel = Panel(kind)
+        elif any(recording.is_mixed for recording in recordings):
+            panel = Panel.MATERIAL
+        else:
+            panel = Panel.SPEED
+        frames = draw_film(recordings, panel, numbers)
 
         temporary = stack.enter_context(atomic_path(path, option="--output"))
         if path.suffix.lower() == ".gif":
@@ -147,14 +153,6 @@ def check_ending(path: Path) -> None:
             f"{path.stem or 'film'}.mp4",
             where="--output",
         )
-
-
-def _choose_panel(kind: Panel | str | None, recordings: Sequence[Recording]) -> Panel:
-    if kind:
-        return Panel(kind)
-    if any(recording.is_mixed for recording in recordings):
-        return Panel.MATERIAL
-    return Panel.SPEED
 
 
 def _encode_mp4(
@@ -220,7 +218,14 @@ def draw_film(
         for recording in recordings:
             frames = _sample_frames(recording)
             recording.fix_slice(frames)
-            _check_vorticity(recording, frames)
+            scenes = map(recording.scene, frames)
+            most = max(np.isfinite(scene.vorticity).sum() for scene in scenes)
+            if most < FEW_NODES:
+                raise UsageError(
+                    f"material is too thin for the grid: at most {most} nodes of a "
+                    "frame have a vorticity; show speed or material",
+                    where="--kind",
+                )
     limit = _common_limit(recordings, panel)
     width = 2 * MARGIN + len(recordings) * (SIDE + GAP) - GAP
     height = TOP + SIDE + BOTTOM
@@ -295,20 +300,6 @@ def _common_limit(recordings: Sequence[Recording], panel: Panel) -> float:
         else:
             tops.append(strongest_limit(limits))
     return strongest_limit(tops)
-
-
-def _check_vorticity(recording: Recording, frames: Sequence[int]) -> None:
-    """Refuse a film of a vorticity that hardly a node has in any frame."""
-    most = 0
-    for frame in frames:
-        count = int(np.isfinite(recording.scene(frame).vorticity).sum())
-        most = max(most, count)
-    if most < FEW_NODES:
-        raise UsageError(
-            f"material is too thin for the grid: at most {most} nodes of a frame have "
-            "a vorticity; show speed or material",
-            where="--kind",
-        )
 
 
 def _sample_frames(recording: Recording) -> list[int]:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.data.grid import Grid
 from lagbench.errors import require
 
 from .canvas import build_speed_map, build_vorticity_map
@@ -52,6 +51,16 @@ TITLES = {  # heading of each panel
 }
 VIEWS = (Panel.FRONT, Panel.ABOVE)
 """Panels of boxes of three dimensions only: particles by speed, in true scale."""
+
+UNIT_SQUARE: dict[str, Any] = {
+    "xlim": (0, 1),
+    "ylim": (0, 1),
+    "xticks": [],
+    "yticks": [],
+    "aspect": "equal",
+    "frame_on": False,
+}
+"""Settings of axes that show a box."""
 
 VIEW_FADE = 0.5
 """Depth of the farthest particle of a view: it is less pale than in the cube."""
@@ -216,15 +225,7 @@ def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats
             yield wall, velocity
 
 
-def _rectangle(place: tuple[float, float, float, float]) -> Rectangle:
-    """Return a rectangle from its left end, bottom, width and height."""
-    from matplotlib.patches import Rectangle
-
-    left, bottom, width, height = place
-    return Rectangle((left, bottom), width, height)
-
-
-def _fill_rectangle(
+def _add_rectangle(
     axes: Axes,
     place: tuple[float, float, float, float],
     colour: str,
@@ -232,8 +233,12 @@ def _fill_rectangle(
     order: float,
 ) -> None:
     """Fill a rectangle from its left end, bottom, width and height; no outline."""
-    rectangle = _rectangle(place)
-    rectangle.set(color=colour, linewidth=0, zorder=order)
+    from matplotlib.patches import Rectangle
+
+    left, bottom, width, height = place
+    rectangle = Rectangle(
+        (left, bottom), width, height, color=colour, linewidth=0, zorder=order
+    )
     axes.add_patch(rectangle)
 
 
@@ -256,19 +261,12 @@ def draw_walls(
         plane: axes to the right and upwards.
         cut: where a plane cuts the third axis, if it shows less than the whole box.
     """
-    axes.set(
-        xlim=(0, 1),
-        ylim=(0, 1),
-        xticks=[],
-        yticks=[],
-        aspect="equal",
-        frame_on=False,
-    )
+    axes.set(**UNIT_SQUARE)
     left, right, bottom, top = box_of(recording, plane)
     width = right - left
     height = top - bottom
-    _fill_rectangle(axes, (0.0, 0.0, 1.0, 1.0), WALL, order=0)
-    _fill_rectangle(axes, (left, bottom, width, height), PAPER, order=0.5)
+    _add_rectangle(axes, (0.0, 0.0, 1.0, 1.0), WALL, order=0)
+    _add_rectangle(axes, (left, bottom, width, height), PAPER, order=0.5)
     if recording.obstacle is not None:
         centre = recording.obstacle[:-1].astype(np.float64)
         radius = float(recording.obstacle[-1])
@@ -306,14 +304,7 @@ def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:
 
     Walls that move are filled.
     """
-    axes.set(
-        xlim=(0, 1),
-        ylim=(0, 1),
-        xticks=[],
-        yticks=[],
-        aspect="equal",
-        frame_on=False,
-    )
+    axes.set(**UNIT_SQUARE)
     view = View(recording.size.box)
     if recording.obstacle is not None:
         centre = view.place(recording.obstacle[:-1])
@@ -334,7 +325,7 @@ def _draw_moving_wall(
 ) -> None:
     """Draw a band with arrowheads that point along its velocity."""
     x, y, width, height = band
-    _fill_rectangle(axes, band, MOVING, order=0.6)
+    _add_rectangle(axes, band, MOVING, order=0.6)
 
     along = velocity / np.abs(velocity).max()
     along_x, along_y = along
@@ -419,11 +410,12 @@ def _box_patch(
     axes: Axes, recording: Recording, plane: tuple[int, int] = (0, 1)
 ) -> Rectangle:
     """Return the inside of the box, to cut drawings off at the walls."""
+    from matplotlib.patches import Rectangle
+
     left, right, bottom, top = box_of(recording, plane)
-    place = (left, bottom, right - left, top - bottom)
-    rectangle = _rectangle(place)
-    rectangle.set_transform(axes.transData)
-    return rectangle
+    return Rectangle(
+        (left, bottom), right - left, top - bottom, transform=axes.transData
+    )
 
 
 def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) -> None:
@@ -465,8 +457,8 @@ def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:
         return
     grid = fields.grid
     x_images, y_images = map(int, grid.box.periodic[:2])  # at each end of an axis
-    x = _places_with_images(grid, 0, x_images)
-    y = _places_with_images(grid, 1, y_images)
+    x = np.pad(grid.places(0), x_images, "reflect", reflect_type="odd")
+    y = np.pad(grid.places(1), y_images, "reflect", reflect_type="odd")
     # lines stay as close to each other on an axis that has images
     density = 0.7 + 0.7 * detail
     x_density = density * (len(x) / grid.shape[0])
@@ -494,15 +486,6 @@ def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:
         stream.lines.set_clip_path(inside)
         for arrowhead in axes.patches[patch_count:]:
             arrowhead.set_clip_path(inside)
-
-
-def _places_with_images(grid: Grid, axis: int, images: int) -> Floats:
-    """Return the positions of nodes and of so many images at each end of an axis."""
-    places = grid.places(axis)
-    steps = np.arange(1, images + 1) * grid.spacing
-    before = places[0] - steps[::-1]
-    after = places[-1] + steps
-    return np.concatenate([before, places, after])
 
 
 def _grid_speed(scene: Scene) -> Floats:

@@ -1,20 +1,16 @@
-"""Pictures of one frame, and contact sheets: many scenarios of a split on one page.
+"""Pictures of one frame, and contact sheets: scenarios of a split over time.
 
 Needs matplotlib: ``pip install 'lagbench[plots]'``. The same frame gives the same
-bytes. Splits whose scenarios draw a ``family`` or ``pair`` get a sheet of one row per
-kind over time; the others get a table of scenarios at one frame.
+bytes.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.data.box import WALL_NAMES
 from lagbench.data.layout import has_file
@@ -41,8 +37,6 @@ from .panels import (
 from .recording import Recording, Scene, name_start, open_recording
 
 if TYPE_CHECKING:
-    import xarray as xr
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ALL = "all"
@@ -72,19 +66,12 @@ FOOT = 0.58
 NARROWEST = 5.0
 
 LEAST_RIM = 0.03  # width of the walls that a cell shows at least [length]
-COLUMNS = 6  # of a table of scenarios at one frame
+MOST_ROWS = 6  # of a sheet of scenarios without kinds
 # moments of a row over time, as shares of the last frame; those of a long recording
 # are close where bodies fall and collide
 TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)
 EVEN_TIMES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 FEWEST_BETWEEN = 5  # frames between two moments; where there are fewer they are even
-# moments of flows that walls drive, as shares of the last frame of interest
-MOMENTS = (1 / 9, 1 / 2, 1.0)
-# most scenarios on a sheet of flows that walls drive, and of flows that only decay
-MOST_DRIVEN = 30
-MOST_DECAYING = 36
-# the fluid itself seldom moves faster than this share of the wall's speed
-WALL_SHARE = 0.6
 
 
 def check_kind(kind: str) -> None:
@@ -100,7 +87,7 @@ def check_kind(kind: str) -> None:
 
 
 def draw_frame(
-    source: str | Path | xr.Dataset,
+    source: str | Path,
     frame: int,
     *,
     kind: str = ALL,
@@ -110,7 +97,7 @@ def draw_frame(
     """Draw one frame of a scenario; :func:`.canvas.save` writes the figure to a file.
 
     Args:
-        source: scenario file, or a data set of one scenario.
+        source: scenario file.
         frame: absolute frame number; negative ones count from the end.
         kind: one of :data:`KINDS`; ``all`` draws three panels side by side.
         dpi: pixels per inch.
@@ -122,8 +109,23 @@ def draw_frame(
     """
     check_kind(kind)
     with open_recording(source, registry=registry) as recording:
-        scene = recording.scene(frame)
-    panels = _choose_panels(kind, recording)
+        return draw_scene(recording.scene(frame), kind=kind, dpi=dpi)
+
+
+def draw_scene(scene: Scene, *, kind: str = ALL, dpi: float = DPI) -> Figure:
+    """Draw one frame; see :func:`draw_frame`."""
+    recording = scene.recording
+    if kind != ALL:
+        _check_view(Panel(kind), recording.size)
+        panels = [Panel(kind)]
+    elif recording.is_solid and not recording.size.is_full_box:
+        # a slice of a splash is thin or empty
+        first = Panel.MATERIAL if recording.is_mixed else Panel.SPEED
+        panels = [first, Panel.FRONT, Panel.ABOVE]
+    elif recording.is_mixed:
+        panels = [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
+    else:
+        panels = [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
     width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
     height = TOP + SIDE + BAR
     is_single = len(panels) == 1
@@ -152,19 +154,6 @@ def draw_frame(
             else:
                 colour_bar(below, panel, limit, is_solid=recording.is_solid)
         return drawn
-
-
-def _choose_panels(kind: str, recording: Recording) -> list[Panel]:
-    if kind != ALL:
-        _check_view(Panel(kind), recording.size)
-        return [Panel(kind)]
-    if recording.is_solid and not recording.size.is_full_box:
-        # a slice of a splash is thin or empty
-        first = Panel.MATERIAL if recording.is_mixed else Panel.SPEED
-        return [first, Panel.FRONT, Panel.ABOVE]
-    if recording.is_mixed:
-        return [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
-    return [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
 
 
 def _check_view(panel: Panel, size: Size) -> None:
@@ -197,20 +186,15 @@ def _describe_scene(scene: Scene) -> str:
         f"t = {scene.time:.2f} s",
     ]
     for wall, velocity in moving_walls(scene.recording, scene.frame):
-        direction = _name_direction(velocity)
+        names = []
+        for component, directions in zip(velocity, DIRECTIONS, strict=False):
+            if component:
+                names.append(directions[int(component > 0.0)])
+        direction = " and ".join(names)
         speed = np.abs(velocity).max()
         name = WALL_NAMES[wall]
         parts.append(f"{name} wall moves {direction} at {speed:.3g} length/s")
     return SEPARATOR.join(parts)
-
-
-def _name_direction(velocity: NDArray[np.float64]) -> str:
-    """Return the direction of a velocity, along each axis along which it points."""
-    names = []
-    for component, (backward, forward) in zip(velocity, DIRECTIONS, strict=False):
-        if component:
-            names.append(forward if component > 0.0 else backward)
-    return " and ".join(names)
 
 
 def _describe_parameters(recording: Recording) -> list[str]:
@@ -227,26 +211,6 @@ def _describe_parameters(recording: Recording) -> list[str]:
     return parts
 
 
-@dataclass(frozen=True)
-class SheetCell:
-    """A small panel of a contact sheet."""
-
-    scene: Scene
-    label: str
-    limit: float  # top of the colour scale
-
-
-@dataclass(frozen=True, kw_only=True)
-class ContactSheet:
-    """What a contact sheet shows."""
-
-    rows: Sequence[Sequence[SheetCell]]
-    panel: Panel  # what every cell shows
-    subtitle: str  # second line of the title
-    limit: float  # top of the colour bar
-    unit: str | None = None  # label of the colour bar where it is not the panel's own
-
-
 def contact_sheet(
     split: str,
     size: str,
@@ -254,11 +218,10 @@ def contact_sheet(
     *,
     root: str | Path | None = None,
     kind: Panel | str | None = None,
-    frame: int | None = None,
     dpi: float = DPI,
     registry: Registry | None = None,
 ) -> Path:
-    """Draw many scenarios of a split on one page; return the path of the file.
+    """Draw scenarios of a split over time on one page; return the path of the file.
 
     Args:
         split: name of the split.
@@ -266,9 +229,6 @@ def contact_sheet(
         output: file to write, ending in .png, .pdf or .svg.
         root: folder that holds all data sets; see ``resolve_root``.
         kind: what each panel shows; the default, as ``all``, suits the split.
-        frame: frame to show where the sheet is a table of scenarios; when None, the
-            first, the last frame of interest of what starts at rest, or three frames up
-            to that of what is driven.
         dpi: pixels per inch.
         registry: where splits are described; ours when None.
 
@@ -284,7 +244,7 @@ def contact_sheet(
         panel = Panel(kind)
         _check_view(panel, tier)
     return draw_contact_sheet(
-        tier, folder, output, registry=splits, panel=panel, frame=frame, dpi=dpi
+        tier, folder, output, registry=splits, panel=panel, dpi=dpi
     )
 
 
@@ -295,11 +255,13 @@ def draw_contact_sheet(
     *,
     registry: Registry,
     panel: Panel | None = None,
-    frame: int | None = None,
     dpi: float = DPI,
     option: str = "--output",
 ) -> Path:
     """Draw the scenarios of a data set that lies in a root folder on one page.
+
+    There is a row for the first scenario of each kind, or for each of the first ones
+    where there are no kinds.
 
     Args:
         tier: the data set.
@@ -307,58 +269,93 @@ def draw_contact_sheet(
         output: file to write, ending in .png, .pdf or .svg.
         registry: where splits are described.
         panel: what each panel shows; the default suits the split.
-        frame: see ``contact_sheet``.
         dpi: pixels per inch.
         option: the option that names another place, for messages.
 
     Raises:
         DataError: no scenario is there, or a file is damaged.
     """
-    files = _list_existing_files(tier, folder)
+    files = []
+    for ids in tier.subsets.values():
+        paths = [tier.path(folder, scenario) for scenario in sorted(ids)]
+        files += [path for path in paths if has_file(path)]
     if not files:
         fix = suggest_repair(tier, root=folder)
         raise DataError(
             f"nothing to draw: no scenario of {tier.split} {tier.name} is there; {fix}"
         )
-    kinds = _first_of_each_kind(files, registry)
-    if kinds:
-        sheet = _arrange_over_time(kinds, panel, registry)
-    else:
-        sheet = _arrange_table(files, panel, frame=frame, splits=registry)
+    chosen = _first_of_each_kind(files, registry)
+    rows = []
+    for kind, path in chosen.items():
+        with open_recording(path, registry=registry) as recording:
+            scenes = [recording.scene(n) for n in choose_moments(recording.frames)]
+        rows.append((f"{recording.scenario}  {kind}", scenes))
+    first = rows[0][1][0].recording
+    if panel is None:
+        panel = Panel.SPEED
+        if any(scenes[0].recording.is_mixed for _, scenes in rows):
+            panel = Panel.MATERIAL
+        elif tier.is_full_box:
+            panel = Panel.VORTICITY
+    limits = []
+    for _, scenes in rows:
+        limits += [limit_of(panel, scene) for scene in scenes]
+    choose = median_limit if panel is Panel.VORTICITY else strongest_limit
+    limit = choose(limits)
+
+    columns = len(TIMES)
+    width = max(2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP, NARROWEST)
+    # Of a low channel a cell shows the channel and its walls, else the unit square.
+    low, high = 0.0, 1.0
+    if not first.is_solid:
+        left, right, bottom, top = box_of(first)
+        rim = max(left, 1.0 - right, LEAST_RIM)
+        low, high = max(0.0, bottom - rim), min(1.0, top + rim)
+    panel_height = CELL * (high - low)
+    row_height = panel_height + LABEL + CELL_GAP
+    height = HEAD + len(rows) * row_height + FOOT
     title = f"{registry.split(tier.split).title} · {tier.split} {tier.name}"
-    return _draw_sheet(sheet, title, output, dpi=dpi, option=option)
-
-
-def _list_existing_files(size: Size, root: Path) -> list[Path]:
-    """Return the scenario files that exist, subset by subset, each by id."""
-    files = []
-    for ids in size.subsets.values():
-        for scenario in sorted(ids):
-            path = size.path(root, scenario)
-            if has_file(path):
-                files.append(path)
-    return files
+    with figure(width, height, dpi=dpi) as drawn:
+        draw_header(drawn, title, f"{len(rows)} scenarios over time", left=RIM)
+        for row, (name, scenes) in enumerate(rows):
+            bottom = height - HEAD - (row + 1) * row_height + CELL_GAP
+            for column, scene in enumerate(scenes):
+                left = RIM + column * (CELL + CELL_GAP)
+                place = (
+                    left / width,
+                    bottom / height,
+                    CELL / width,
+                    panel_height / height,
+                )
+                axes = drawn.add_axes(place)
+                label = name if column == 0 else f"frame {scene.frame}"
+                text = axes.set_title(label, fontsize=7.5, color=MUTED, pad=2.5)
+                shrink(text, CELL)
+                draw(axes, panel, scene, limit=limit, detail=0.0)
+                axes.set(ylim=(low, high))
+        place = (RIM / width, 0.42 / height, 2.6 / width, 0.09 / height)
+        below = drawn.add_axes(place)
+        if panel is Panel.MATERIAL:
+            materials = [scenes[0].recording.material for _, scenes in rows]
+            draw_material_key(below, np.concatenate(materials))
+        else:
+            colour_bar(below, panel, limit, is_solid=first.is_solid)
+        return save(drawn, output, option=option)
 
 
 def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Path]:
-    """Return the first scenario of every family or pair, in the order of names."""
-    paths: dict[str, Path] = {}
+    """Return the first scenario of every kind, or the first ones by what they are."""
+    kinds: dict[str, Path] = {}
+    others: dict[str, Path] = {}
     for path in files:
         with open_recording(path, registry=splits) as recording:
-            parameters = recording.parameters
+            marks = _describe_parameters(recording)
         for name in KIND_PARAMETERS:
-            kind = str(parameters.get(name, ""))
-            if kind:
-                paths.setdefault(kind, path)
-                break
-
-    def file_name(kind: str) -> str:
-        return paths[kind].name
-
-    paths_by_name = {}
-    for kind in sorted(paths, key=file_name):
-        paths_by_name[kind] = paths[kind]
-    return paths_by_name
+            if name in recording.parameters:
+                kinds.setdefault(str(recording.parameters[name]), path)
+        if len(others) < MOST_ROWS:
+            others.setdefault(" ".join(marks[:1]) or path.stem, path)
+    return dict(sorted(kinds.items(), key=lambda item: item[1].name)) or others
 
 
 def choose_moments(frames: int) -> list[int]:
@@ -368,177 +365,3 @@ def choose_moments(frames: int) -> list[int]:
     if TIMES[1] * last < FEWEST_BETWEEN:
         shares = EVEN_TIMES
     return [round(share * last) for share in shares]
-
-
-def _arrange_over_time(
-    kinds: Mapping[str, Path], panel: Panel | None, splits: Registry
-) -> ContactSheet:
-    """Return one row per kind: the same moments of each, one colour scale."""
-    rows = []
-    is_mixed = False
-    for path in kinds.values():
-        row = []
-        with open_recording(path, registry=splits) as recording:
-            is_mixed = is_mixed or recording.is_mixed
-            for number in choose_moments(recording.frames):
-                row.append(recording.scene(number))
-        rows.append(row)
-    if panel is None and is_mixed:
-        panel = Panel.MATERIAL
-    elif panel is None:
-        panel = Panel.SPEED
-
-    limits = []
-    for scene in itertools.chain(*rows):
-        limits.append(limit_of(panel, scene))
-    limit = strongest_limit(limits)
-    cells = []
-    for kind, row in zip(kinds, rows, strict=True):
-        line = []
-        for scene in row:
-            label = f"frame {scene.frame}"
-            if scene is row[0]:
-                label = f"{scene.recording.scenario}  {kind}"
-            line.append(SheetCell(scene, label, limit))
-        cells.append(line)
-    return ContactSheet(
-        rows=cells,
-        panel=panel,
-        subtitle="the first scenario of each kind over time",
-        limit=limit,
-    )
-
-
-def _arrange_table(
-    files: Sequence[Path], panel: Panel | None, *, frame: int | None, splits: Registry
-) -> ContactSheet:
-    """Return a table of scenarios at one frame, or at three where walls drive them."""
-    with open_recording(files[0], registry=splits) as recording:
-        is_driven = bool(recording.wall_velocity.any())
-        if frame is None:
-            frames = _choose_frames(recording)
-        else:
-            frames = [frame]
-    if is_driven:
-        shown_files = files[:MOST_DRIVEN]
-        panel = panel or Panel.STREAMLINES
-    else:
-        shown_files = files[:MOST_DECAYING]
-        panel = panel or Panel.VORTICITY
-
-    scenes = []
-    limits = []
-    for path in shown_files:
-        with open_recording(path, registry=splits) as recording:
-            for number in frames:
-                scene = recording.scene(number)
-                scenes.append(scene)
-                limits.append(limit_of(panel, scene))
-    common_limit = median_limit(limits)
-
-    # speeds of driven flows are compared with the speed of the wall
-    is_wall_scaled = is_driven and panel in (Panel.STREAMLINES, Panel.SPEED)
-    cells = []
-    for number, scene in enumerate(scenes):
-        is_first_of_scenario = number % len(frames) == 0
-        if is_first_of_scenario:
-            recording = scene.recording
-            marks = _describe_parameters(recording)[:1]
-            label = "   ".join([str(recording.scenario), *marks])
-        else:
-            label = f"frame {scene.frame}"
-        limit = common_limit
-        if is_wall_scaled:
-            wall_speed = np.abs(scene.recording.wall_velocity).max()
-            limit = WALL_SHARE * wall_speed
-        cells.append(SheetCell(scene, label, limit))
-
-    columns = COLUMNS
-    if len(frames) > 1:
-        columns = 3 * len(frames)
-    rows = []
-    for first in range(0, len(cells), columns):
-        rows.append(cells[first : first + columns])
-    shown_frames = ", ".join(str(scene.frame) for scene in scenes[: len(frames)])
-    subtitle = f"{len(shown_files)} scenarios at frame {shown_frames}"
-    if is_wall_scaled:
-        return ContactSheet(
-            rows=rows,
-            panel=panel,
-            subtitle=subtitle,
-            limit=WALL_SHARE,
-            unit="speed / wall speed",
-        )
-    return ContactSheet(rows=rows, panel=panel, subtitle=subtitle, limit=common_limit)
-
-
-def _choose_frames(recording: Recording) -> list[int]:
-    """Return the frames of a table of scenarios like this one."""
-    latest = recording.size.task.frames_of_interest[-1]
-    latest = min(latest, recording.frames - 1)
-    if recording.wall_velocity.any():
-        return [round(share * latest) for share in MOMENTS]
-    starts_at_rest = not recording.scene(0).speed.any()
-    if starts_at_rest:
-        return [latest]
-    return [0]
-
-
-def _draw_sheet(
-    sheet: ContactSheet, title: str, output: str | Path, *, dpi: float, option: str
-) -> Path:
-    """Draw a contact sheet; return the path of its file."""
-    columns = max(map(len, sheet.rows))
-    width = max(2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP, NARROWEST)
-    low, high = _heights_shown(sheet.rows[0][0].scene.recording)
-    panel_height = CELL * (high - low)
-    row_height = panel_height + LABEL + CELL_GAP
-    height = HEAD + len(sheet.rows) * row_height + FOOT
-    with figure(width, height, dpi=dpi) as drawn:
-        draw_header(drawn, title, sheet.subtitle, left=RIM)
-        cell_width = CELL / width
-        cell_height = panel_height / height
-        for row, cells in enumerate(sheet.rows):
-            bottom = height - HEAD - (row + 1) * row_height + CELL_GAP
-            for column, cell in enumerate(cells):
-                left = RIM + column * (CELL + CELL_GAP)
-                place = (left / width, bottom / height, cell_width, cell_height)
-                axes = drawn.add_axes(place)
-                _draw_cell(axes, sheet.panel, cell)
-                axes.set(ylim=(low, high))
-        _draw_key(drawn, sheet, width=width, height=height)
-        return save(drawn, output, option=option)
-
-
-def _heights_shown(recording: Recording) -> tuple[float, float]:
-    """Return the lowest and the highest place that a cell shows [length].
-
-    A cell shows the unit square, or of a low channel the channel and its walls.
-    """
-    if recording.is_solid:
-        return 0.0, 1.0
-    left, right, bottom, top = box_of(recording)
-    rim = max(left, 1.0 - right, LEAST_RIM)
-    return max(0.0, bottom - rim), min(1.0, top + rim)
-
-
-def _draw_cell(axes: Axes, panel: Panel, cell: SheetCell) -> None:
-    title = axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
-    shrink(title, CELL)
-    draw(axes, panel, cell.scene, limit=cell.limit, detail=0.0)
-
-
-def _draw_key(
-    drawn: Figure, sheet: ContactSheet, *, width: float, height: float
-) -> None:
-    """Draw the colour bar or the key of materials below the cells."""
-    place = (RIM / width, 0.42 / height, 2.6 / width, 0.09 / height)
-    below = drawn.add_axes(place)
-    if sheet.panel is Panel.MATERIAL:
-        materials = []
-        for cell in itertools.chain(*sheet.rows):
-            materials.append(cell.scene.recording.material)
-        draw_material_key(below, np.concatenate(materials))
-    else:
-        is_solid = sheet.rows[0][0].scene.recording.is_solid
-        colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit, is_solid=is_solid)

@@ -1,17 +1,13 @@
-"""A scenario as pictures need it: frames, walls, names and grid fields.
-
-A recording is a scenario file, or an ``xarray.Dataset`` of one scenario as
-``xarray.open_dataset`` and ``lagbench.open_split(...).sel(scenario=3)`` give it.
-"""
+"""A scenario as pictures need it: frames, walls, names and grid fields."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +15,13 @@ from numpy.typing import NDArray
 from lagbench.data import grid as gridding
 from lagbench.data.box import parse_obstacle
 from lagbench.data.local import load_rooted_registry
-from lagbench.data.registry import Registry, Size, load
-from lagbench.data.scenario import read_scenario, require_known_material
+from lagbench.data.registry import Registry, Size
+from lagbench.data.scenario import (
+    ScenarioFile,
+    read_scenario,
+    require_known_material,
+)
 from lagbench.errors import UsageError
-
-if TYPE_CHECKING:
-    import xarray as xr
-
-# from the name of a variable and one or several frames to its values
-Read = Callable[[str, slice | int], NDArray[Any]]
-
-IDENTITY = ("split", "size", "scenario")  # what names a scenario
-
-# variables that every picture needs
-DRAWN_VARIABLES = ("position", "material", "particle_mass")
 
 # folders between the root of all data sets and a scenario file
 DEPTH = 4
@@ -123,65 +112,40 @@ class Scene:
 class Recording:
     """A scenario whose frames are read one at a time."""
 
-    def __init__(
-        self,
-        identity: Mapping[str, Any],
-        *,
-        parameters: Mapping[str, Any],
-        frames: int,
-        variables: set[str],
-        read: Read,
-        registry: Registry,
-        file: str | None = None,
-    ) -> None:
+    def __init__(self, file: ScenarioFile, registry: Registry, *, where: str) -> None:
         """Read what holds for all frames.
 
         Args:
-            identity: split, size and id of the scenario.
-            parameters: physical parameters by name.
-            frames: number of recorded frames.
-            variables: names of the recorded variables.
-            read: returns a variable at one or several frames.
+            file: the scenario.
             registry: where the split is described.
-            file: path of the scenario file, for messages; None where it is not known.
+            where: path of the file, for messages.
 
         Raises:
             DataError: the obstacle has no place or no size, or a number stands for no
                 material.
         """
-        self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
+        header = file.header
+        self.size: Size = registry.size(header.key.split, header.key.size)
         self.title = registry.split(self.size.split).title
-        self.scenario = int(identity["scenario"])
-        self.parameters = parameters
-        self.frames = frames
+        self.scenario = header.key.scenario
+        self.parameters = header.parameters
+        self.frames = header.frames
         # number along z of the slice of all frames; None: the best one of each frame
         self.layer: int | None = None
-        self._read = read
-        # rows of NaN fill up scenarios that have fewer particles than others
-        self._is_present = np.isfinite(read("position", 0)).all(axis=-1)
-        where = file or f"{self.size.split} {self.size.name}, scenario {self.scenario}"
-        material = read("material", slice(None))[self._is_present]
+        self._read = file.read
+        material = file.read("material")
         fix = "state a material of lagbench for every particle"
         require_known_material(material, where=where, fix=fix)
         self.material = material.astype(np.int8)
         # [length/s], shape [frame, wall, axis]; zeros without walls
         dimension = self.size.dimension
-        self.wall_velocity = np.zeros((frames, 2 * dimension, dimension))
-        if "wall_velocity" in variables:
-            self.wall_velocity[:] = read("wall_velocity", slice(frames))
+        self.wall_velocity = np.zeros((self.frames, 2 * dimension, dimension))
+        if "wall_velocity" in file.variables:
+            self.wall_velocity[:] = file.read("wall_velocity")
         # centre and radius of a fixed obstacle [length]; None without one
-        self.obstacle = self._obstacle(read, variables, where=where)
-        self._has_velocity = "velocity" in variables
-        self._particle_mass = float(read("particle_mass", slice(None)))
-
-    def _obstacle(
-        self, read: Read, variables: set[str], *, where: str
-    ) -> NDArray[np.float32] | None:
-        """Return centre and radius of the obstacle that a file or data set states."""
-        if "obstacle" in variables:
-            stated = read("obstacle", slice(None))
-            return np.asarray(stated, np.float32)
-        return parse_obstacle(self.parameters, self.size.dimension, where=where)
+        self.obstacle = parse_obstacle(self.parameters, dimension, where=where)
+        self._has_velocity = "velocity" in file.variables
+        self._particle_mass = float(file.read("particle_mass"))
 
     @property
     def particles(self) -> int:
@@ -275,7 +239,7 @@ class Recording:
         return Scene(self, number, position, velocity, displacement)
 
     def _read_particles(self, name: str, frame: int) -> NDArray[np.float64]:
-        return self._read(name, frame)[self._is_present].astype(np.float64)
+        return self._read(name, frame).astype(np.float64)
 
 
 def name_start(parameters: Mapping[str, Any]) -> str:
@@ -292,105 +256,19 @@ def name_start(parameters: Mapping[str, Any]) -> str:
 
 @contextmanager
 def open_recording(
-    source: str | Path | xr.Dataset, *, registry: Registry | None = None
+    source: str | Path, *, registry: Registry | None = None
 ) -> Iterator[Recording]:
-    """Open a scenario file, or a data set of one scenario, for drawing.
+    """Open a scenario file for drawing.
 
     Args:
-        source: scenario file, or data set of one scenario with all its frames.
-        registry: where splits are described; ours when None.
+        source: scenario file.
+        registry: where splits are described; ours when None. Local splits around the
+            file are known too.
 
     Raises:
-        UsageError: the data set has several scenarios, or lacks frames, variables or
-            attributes.
         DataError: the scenario file is missing or damaged.
     """
-    if not isinstance(source, str | Path):
-        yield _record_dataset(source, registry)
-        return
-    with read_scenario(Path(source)) as file:
-        key = file.header.key
-        yield Recording(
-            {"split": key.split, "size": key.size, "scenario": key.scenario},
-            parameters=file.header.parameters,
-            frames=file.header.frames,
-            variables={*file.variables},
-            read=file.read,
-            registry=_registry_around(source, registry),
-            file=str(source),
-        )
-
-
-def _registry_around(file: str | Path, registry: Registry | None) -> Registry:
-    """Return a registry that also knows the local splits around a scenario file."""
-    parents = Path(file).absolute().parents
+    parents = Path(source).absolute().parents
     root = parents[min(DEPTH, len(parents) - 1)]
-    return load_rooted_registry(root, registry)
-
-
-def _record_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
-    """Return the recording that a data set of one scenario holds."""
-    if "scenario" in data.dims:
-        raise UsageError(
-            f"a picture shows one scenario, not {data.sizes['scenario']}; choose one, "
-            "as in data.sel(scenario=3)"
-        )
-    attributes: dict[str, Any] = {str(name): v for name, v in data.attrs.items()}
-    _require_complete(data)
-    identity = {}
-    for name in IDENTITY:
-        if name in data.coords:
-            identity[name] = data.coords[name].item()
-        else:
-            identity[name] = attributes[name]
-
-    def read(name: str, frames: slice | int) -> NDArray[Any]:
-        variable = data[name]
-        if "frame" in variable.dims:
-            variable = variable.isel(frame=frames)
-        return np.asarray(variable)
-
-    # as xarray and open_split note where the data are from
-    file = data.encoding.get("source")
-    if isinstance(file, str | Path):
-        registry = _registry_around(file, registry)
-    elif registry is None:
-        registry = load()
-    return Recording(
-        identity,
-        parameters=attributes,
-        frames=_count_frames(data),
-        variables={str(name) for name in data.variables},
-        read=read,
-        registry=registry,
-    )
-
-
-def _require_complete(data: xr.Dataset) -> None:
-    """Refuse a data set that lacks what every picture needs."""
-    missing = []
-    for name in IDENTITY:
-        if name not in data.coords and name not in data.attrs:
-            missing.append(f"attribute {name}")
-    for name in DRAWN_VARIABLES:
-        if name not in data:
-            missing.append(f"variable {name}")
-    if missing:
-        raise UsageError(
-            f"the data set has no {', no '.join(missing)}; keep all variables and "
-            "attributes of a scenario, as xr.set_options(keep_attrs=True) does"
-        )
-
-
-def _count_frames(data: xr.Dataset) -> int:
-    """Return how many frames a data set of one scenario has; padding does not count."""
-    numbers = data["frame"].values.tolist() if "frame" in data.dims else []
-    frame_count = len(numbers)
-    if "frame_count" in data:
-        frame_count = int(data["frame_count"])
-    if numbers != list(range(max(frame_count, len(numbers), 1))):
-        raise UsageError(
-            "a picture needs all frames of a scenario, from 0 on; choose a scenario "
-            "only, as in data.sel(scenario=3), and say which frame to draw"
-        )
-    return frame_count
+    with read_scenario(Path(source)) as file:
+        yield Recording(file, load_rooted_registry(root, registry), where=str(source))

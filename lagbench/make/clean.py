@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ from lagbench.data.layout import (
 )
 from lagbench.data.local import DESCRIPTION, locate
 from lagbench.data.lock import LOCK_NAME, dataset_lock
-from lagbench.data.registry import Registry, Size
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
 
 # what lagbench writes beside the subsets
 CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
@@ -71,7 +70,12 @@ def clean(
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
     if not (tier.simulated or leftovers or force):
-        raise _local_split_error(tier, home)
+        names = f"--split {tier.split} --size {tier.name} --root {quote_root(home)}"
+        raise UsageError(
+            "lagbench cannot make these data again: a local split, made by import; "
+            f"lagbench clean {names} --force",
+            where=str(folder),
+        )
 
     lock: AbstractContextManager[object]
     if dry_run:
@@ -81,74 +85,26 @@ def clean(
     with lock:
         paths = {path for path in folder.rglob(f".*{SUFFIX}") if path.is_file()}
         if not leftovers:
-            paths |= _data_set_files(tier, folder)
-        length = _total_length(paths)
+            for subset, ids in tier.subsets.items():
+                paths.update(folder / subset / f"{i:04d}.nc" for i in ids)
+            if tier.simulated:
+                paths.update(folder / name for name in CARDS)
+            else:
+                # A local split has no cards; its description says nothing without data.
+                paths |= {folder / MANIFEST_NAME, folder.parents[1] / DESCRIPTION}
+        paths = {path for path in paths if path.is_file()}
+        length = sum(path.stat().st_size for path in paths)
         if not dry_run:
-            _remove_files(paths)
+            for path in paths:
+                path.unlink(missing_ok=True)
             if not leftovers:
                 # whoever waits for a lock that is gone takes a new one
                 for name in (NOTES_NAME, LOCK_NAME):
                     (folder / name).unlink(missing_ok=True)
     if not dry_run and not leftovers:
-        _remove_empty_folders(folder, home)
-    return CleanResult(removed=tuple(sorted(paths)), bytes=length, dry_run=dry_run)
-
-
-def _local_split_error(size: Size, home: Path) -> UsageError:
-    names = f"--split {size.split} --size {size.name} --root {quote_root(home)}"
-    return UsageError(
-        "lagbench cannot make these data again: a local split, made by import; "
-        f"lagbench clean {names} --force",
-        where=str(size.folder(home)),
-    )
-
-
-def _data_set_files(size: Size, folder: Path) -> set[Path]:
-    """Return the files of a data set that lagbench wrote and that are there."""
-    paths = set()
-    for subset, ids in size.subsets.items():
-        for scenario in ids:
-            paths.add(folder / subset / f"{scenario:04d}.nc")
-    if size.simulated:
-        for name in CARDS:
-            paths.add(folder / name)
-    else:
-        # A local split has no cards; its description says nothing without its data.
-        paths |= {folder / MANIFEST_NAME, folder.parents[1] / DESCRIPTION}
-    return {path for path in paths if path.is_file()}
-
-
-def _total_length(paths: Iterable[Path]) -> int:
-    length = 0
-    for path in paths:
-        # a dry run may stand beside a writer
-        with suppress(FileNotFoundError):
-            length += path.stat().st_size
-    return length
-
-
-def _remove_files(paths: Iterable[Path]) -> None:
-    for path in paths:
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise WorkFailedError(
-                f"cannot remove a file: {error.strerror}; see who owns the file and "
-                "its folder: ls -l",
-                where=str(path),
-            ) from error
-
-
-def _remove_empty_folders(folder: Path, home: Path) -> None:
-    """Remove folders that hold nothing any more, up to the root folder; links stay."""
-    # another process may have been faster
-    with suppress(OSError):
-        children = []
-        for child in folder.iterdir():
-            if child.is_dir():
-                children.append(child)
-        for place in (*children, folder, *folder.parents):
-            if home in place.parents and not place.is_symlink():
-                # a folder that holds something stays
+        # folders that hold nothing any more, up to the root folder; links stay
+        for place in (*folder.iterdir(), folder, *folder.parents):
+            if home in place.parents and place.is_dir() and not place.is_symlink():
                 with suppress(OSError):
                     place.rmdir()
+    return CleanResult(removed=tuple(sorted(paths)), bytes=length, dry_run=dry_run)

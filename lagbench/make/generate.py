@@ -11,13 +11,14 @@ take it along.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from contextlib import closing, nullcontext
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import NamedTuple, TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
@@ -35,26 +36,33 @@ from lagbench.data.manifest import (
 )
 from lagbench.data.registry import Registry, Size, Split
 from lagbench.data.statistics import file_moments, statistics
-from lagbench.errors import UsageError, check_installed, suggest_name
+from lagbench.errors import (
+    UsageError,
+    WorkFailedError,
+    check_installed,
+    suggest_name,
+)
 from lagbench.generators.batch import (
     SimulationJob,
     perturbed_substep_count,
+    substep_count,
 )
-from lagbench.generators.simulate import (
-    SimulatedScenario,
-    measure_predictability,
-    simulate,
-)
+from lagbench.generators.simulate import measure_predictability, simulate
 from lagbench.generators.split import Device
+from lagbench.store.copy import Publication, publish
 from lagbench.store.copy import gather as gather_files
-from lagbench.store.copy import list_scenarios_to_gather
-from lagbench.store.publication import Publication, check_address, publish
-from lagbench.work.cluster import Cluster, await_file
-from lagbench.work.machine import describe_machine, promises_bits, worker_count
-from lagbench.work.pool import Event, Pool, Report, WorkItem
-from lagbench.work.run import ONE_THREAD, Meter, Progress, read_many
+from lagbench.store.objects import Objects
+from lagbench.work.executor import (
+    ONE_THREAD,
+    Finished,
+    Report,
+    WorkItem,
+    run_items,
+)
+from lagbench.work.machine import promises_bits, worker_count
+from lagbench.work.run import Meter, Progress, read_many
 
-from .cards import card_texts, write_cards
+from .cards import write_cards
 from .inventory import (
     compare_hashes,
     has_all_statistics,
@@ -76,6 +84,9 @@ Result = TypeVar("Result")
 
 # particles that a parallel device advances together at the most
 BATCH_PARTICLES = 1 << 19
+
+FILE_SECONDS = 30.0
+"""How long a file of another machine may take to appear [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,15 +167,21 @@ def generate(
     started = time.monotonic()
     address = root_url(root)
     if address is not None:
-        check_address(address)
+        Objects(address, "")  # refuses an address where nothing can be written
     tier, data_root, rooted_registry = locate_new(
         split, size, root=root, registry=registry
     )
     wanted_ids = select(tier, subset=subset, scenarios=scenarios)
-    target = _find_device(device)
+    devices = list(map(str, Device))
+    if device not in devices:
+        raise UsageError(
+            f"no device {device!r}; {suggest_name(device, devices)}", where="--device"
+        )
+    target = Device(device)
     cores = worker_count(workers, default=None if target is Device.CPU else 1)
     bytes_free = free_bytes(tier.folder(data_root))
-    setup = _Setup(
+    url = url_of(data_root)
+    campaign = _Campaign(
         size=tier,
         split=rooted_registry.split(tier.split),
         root=data_root,
@@ -172,11 +189,19 @@ def generate(
         workers=cores,
         scheduler=scheduler,
         meter=Meter(progress),
+        store=None,
     )
     sources = [expand_path(source, "--gather") for source in gather]
 
     if dry_run:
-        scan = _plan_only(setup, wanted_ids, sources, force=force)
+        if url is not None:
+            campaign.store = Publication(tier, data_root, url)
+        joint = campaign.manifest
+        for source in sources:
+            joint = gather_files(tier, data_root, source, joint, dry_run=True)
+        old = campaign.manifest
+        gathered = {e.scenario for e in joint.files if old.entry(e.scenario) is None}
+        scan = _scan_folder(campaign, wanted_ids, force=force, gathered=gathered)
         manifest = scan.manifest
         verdict = ""
     else:
@@ -184,14 +209,34 @@ def generate(
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(data_root, tier.split, tier.name, tier.major, on_wait=on_wait),
-            _open_store(setup) as store,
+            nullcontext() if url is None else publish(tier, data_root, url) as store,
         ):
-            keeper = _ManifestKeeper(setup, store)
-            scan = _simulate_missing(setup, keeper, wanted_ids, sources, force=force)
-            _complete_statistics(setup, keeper)
-            manifest = keeper.manifest
-            verdict = compare_hashes(tier, manifest, promised=keeper.promised)
-            _describe(setup, store, manifest)
+            campaign.store = store
+            campaign.manifest = read_or_empty(tier, data_root)
+            remove_leftovers(campaign.folder)
+            for source in sources:
+                joint = gather_files(tier, data_root, source, campaign.manifest)
+                campaign.keep(joint)
+            scan = _scan_folder(campaign, wanted_ids, force=force)
+            record_entry_hashes(campaign.folder, scan.hashed)
+            check_disk(data_root, scan.to_do.bytes)
+            campaign.keep(scan.manifest)
+            try:
+                _simulate(campaign, scan)
+            finally:
+                # The workers are gone by now; what they had not finished goes too.
+                remove_leftovers(campaign.folder)
+            _complete_statistics(campaign)
+            manifest = campaign.manifest
+            verdict = compare_hashes(tier, manifest, promised=campaign.promised)
+            # Scenarios of a blind test have no card: it would say how to make the
+            # public ones.
+            if tier.draw_seed is None and not _is_settled(campaign, scan):
+                campaign.meter.begin("cards", total=1, scenarios=len(manifest.files))
+                campaign.fetch(tier.scenarios)
+                cards = write_cards(data_root, tier, campaign.split, manifest)
+                if store is not None:
+                    store.put_files(manifest, cards)
 
     missing_ids = []
     for scenario in tier.scenarios:
@@ -202,7 +247,7 @@ def generate(
         size=tier.name,
         version=tier.version,
         root=data_root,
-        folder=setup.folder,
+        folder=campaign.folder,
         device=target.value,
         workers=cores,
         simulated=scan.to_do.scenarios,
@@ -219,20 +264,9 @@ def generate(
     )
 
 
-def _find_device(name: str) -> Device:
-    names = list(map(str, Device))
-    if name not in names:
-        raise UsageError(
-            f"no device {name!r}: expected {', '.join(names)}; "
-            f"{suggest_name(name, names)}",
-            where="--device",
-        )
-    return Device(name)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Setup:
-    """What a generation makes, where, and with what."""
+@dataclass(kw_only=True)
+class _Campaign:
+    """What a generation makes, where, and with what; it keeps the manifest."""
 
     size: Size  # tier to generate
     split: Split  # split that it belongs to
@@ -241,15 +275,32 @@ class _Setup:
     workers: int  # worker processes
     scheduler: str | None  # Dask scheduler whose workers simulate; None: here
     meter: Meter  # counts the work
+    # the store that the root folder is a working copy of; None if plain
+    store: Publication | None
+    # ids that were simulated on machines that promise equal bits
+    promised: list[int] = field(default_factory=list)
 
-    @property
-    def folder(self) -> Path:
-        """Folder of the data set."""
-        return self.size.folder(self.root)
+    def __post_init__(self) -> None:
+        """Read the manifest."""
+        self.folder = self.size.folder(self.root)  # of the data set
+        self.manifest = read_or_empty(self.size, self.root)
 
     def path(self, scenario: int) -> Path:
         """Return the file of a scenario."""
         return self.size.path(self.root, scenario)
+
+    def keep(self, manifest: Manifest) -> None:
+        """Write a manifest, but no empty one where there is none yet."""
+        self.manifest = manifest
+        if manifest.files or (self.folder / MANIFEST_NAME).exists():
+            write_manifest(self.root, manifest)
+            if self.store:
+                self.store.put_files(manifest)
+
+    def fetch(self, scenarios: Iterable[int]) -> None:
+        """Have files of scenarios here that only the store holds."""
+        if self.store:
+            self.store.fetch(scenarios)
 
     def read_files(
         self,
@@ -279,90 +330,8 @@ class _Scan:
     to_do: Estimate  # chosen ids to simulate, and what that takes
 
 
-class _ManifestKeeper:
-    """Writes the manifest of a folder whenever it changes; the store follows."""
-
-    def __init__(self, setup: _Setup, store: Publication | None) -> None:
-        self._setup = setup
-        # the store that the root folder is a working copy of; None if plain
-        self.store = store
-        self.manifest = read_or_empty(setup.size, setup.root)
-        # ids that were simulated on machines that promise equal bits
-        self.promised: list[int] = []
-
-    def keep(self, manifest: Manifest) -> None:
-        """Write a manifest, but no empty one where there is none yet."""
-        self.manifest = manifest
-        if manifest.files or (self._setup.folder / MANIFEST_NAME).exists():
-            write_manifest(self._setup.root, manifest)
-            if self.store:
-                self.store.put_files(manifest)
-
-    def add(
-        self,
-        entries: Iterable[FileEntry],
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
-        """Put entries in, and the machine that wrote their files."""
-        self.keep(merge_entries(self._setup.size, self.manifest, entries, environment))
-
-    def fetch(self, scenarios: Iterable[int]) -> None:
-        """Have files of scenarios here that only the store holds."""
-        if self.store:
-            self.store.fetch(scenarios)
-
-
-def _open_store(setup: _Setup) -> AbstractContextManager[Publication | None]:
-    """Return the store that the root folder is a working copy of; None if plain."""
-    url = url_of(setup.root)
-    if url is None:
-        return nullcontext()
-    return publish(setup.size, setup.root, url)
-
-
-def _plan_only(
-    setup: _Setup, wanted_ids: Sequence[int], sources: Sequence[Path], *, force: bool
-) -> _Scan:
-    """Scan a folder as if the sources were gathered; change nothing."""
-    gathered: set[int] = set()
-    for source in sources:
-        gathered.update(list_scenarios_to_gather(setup.size, setup.root, source))
-    store = None
-    url = url_of(setup.root)
-    if url is not None:
-        store = Publication(setup.size, setup.root, url)
-    return _scan_folder(setup, store, wanted_ids, force=force, gathered=gathered)
-
-
-def _simulate_missing(
-    setup: _Setup,
-    keeper: _ManifestKeeper,
-    wanted_ids: Sequence[int],
-    sources: Sequence[Path],
-    *,
-    force: bool,
-) -> _Scan:
-    """Gather, scan, and simulate what is missing or wrong; return the scan before."""
-    remove_leftovers(setup.folder)
-    for source in sources:
-        old = read_or_empty(setup.size, setup.root)
-        keeper.keep(gather_files(setup.size, setup.root, source, old))
-
-    scan = _scan_folder(setup, keeper.store, wanted_ids, force=force)
-    record_entry_hashes(setup.folder, scan.hashed)
-    check_disk(setup.root, scan.to_do.bytes)
-    keeper.keep(scan.manifest)
-    try:
-        _simulate(setup, keeper, scan)
-    finally:
-        # The workers are gone by now; what they had not finished goes too.
-        remove_leftovers(setup.folder)
-    return scan
-
-
 def _scan_folder(
-    setup: _Setup,
-    store: Publication | None,
+    campaign: _Campaign,
     wanted_ids: Sequence[int],
     *,
     force: bool,
@@ -373,28 +342,34 @@ def _scan_folder(
     Nothing is written. ``gathered`` is given in a dry run: the ids that gathering would
     bring. They count as right, and hashes of the manifest are trusted.
     """
-    size = setup.size
-    old = read_or_empty(size, setup.root)
-    stored: Mapping[int, FileEntry] = {}
-    if store:
-        stored = store.stored_entries
-    # All wanted ids that no store holds, and every file that the manifest belies.
-    inspected_ids = _ids_to_inspect(setup, old, stored, wanted_ids)
+    size = campaign.size
+    old = campaign.manifest
+    stored = campaign.store.stored_entries if campaign.store else {}
+    # All wanted ids that no store holds, and every file that has appeared, has vanished
+    # or has changed its length since the manifest was written.
+    lengths = {entry.scenario: entry.bytes for entry in old.files}
+    inspected_ids = []
+    for scenario in size.scenarios:
+        path = campaign.path(scenario)
+        length = path.stat().st_size if path.exists() else None
+        has_changed = length != lengths.get(scenario)
+        if scenario not in stored and (scenario in wanted_ids or has_changed):
+            inspected_ids.append(scenario)
     inspected_count = len(inspected_ids)
-    setup.meter.begin("checking", total=inspected_count, scenarios=inspected_count)
+    campaign.meter.begin("checking", total=inspected_count, scenarios=inspected_count)
     inspections = {}
     for scenario in inspected_ids:
         inspections[f"scenario {scenario}"] = partial(
             inspect_scenario,
-            setup.root,
+            campaign.root,
             size,
             scenario,
             manifest=old.only(scenario),
             quick=True,
             trusting=gathered is not None,
         )
-    paths = map(setup.path, inspected_ids)
-    results = setup.read_files(run_inspection, inspections, paths)
+    paths = map(campaign.path, inspected_ids)
+    results = campaign.read_files(run_inspection, inspections, paths)
 
     hashed = []
     bad_ids = set(inspected_ids)  # until an inspection proves a file right
@@ -402,11 +377,8 @@ def _scan_folder(
         if result.entry:
             hashed.append(result.entry)
             bad_ids.discard(result.scenario)
-    old_entries = []
-    for entry in old.files:
-        if entry.scenario not in bad_ids:
-            old_entries.append(entry)
-    base = old.model_copy(update={"files": tuple(old_entries)})
+    good_entries = [entry for entry in old.files if entry.scenario not in bad_ids]
+    base = old.model_copy(update={"files": tuple(good_entries)})
 
     kept_ids = []
     missing_ids = []
@@ -424,199 +396,155 @@ def _scan_folder(
     )
 
 
-def _ids_to_inspect(
-    setup: _Setup,
-    old: Manifest,
-    stored: Collection[int],
-    wanted_ids: Sequence[int],
-) -> list[int]:
-    """Return the ids whose files must be read before anything is simulated.
-
-    These are the wanted ids, and the ids whose file has appeared, has vanished, or has
-    changed its length since the manifest was written. Files in the store are right, so
-    their ids are left out.
-    """
-    stated_lengths = {}
-    for entry in old.files:
-        stated_lengths[entry.scenario] = entry.bytes
-    ids = []
-    for scenario in setup.size.scenarios:
-        if scenario in stored:
-            continue
-        length = None
-        path = setup.path(scenario)
-        if path.exists():
-            length = path.stat().st_size
-        has_changed = length != stated_lengths.get(scenario)
-        if scenario in wanted_ids or has_changed:
-            ids.append(scenario)
-    return ids
-
-
-def _simulate(setup: _Setup, keeper: _ManifestKeeper, scan: _Scan) -> None:
+def _simulate(campaign: _Campaign, scan: _Scan) -> None:
     """Run everything that is to do in workers, and perturbed runs of test scenarios."""
-    size = setup.size
+    size = campaign.size
     test_ids = size.subsets.get("test", ())
     # files that are right and have no predictability limit yet
     unlimited_ids = []
-    for entry in keeper.manifest.files:
+    for entry in campaign.manifest.files:
         is_kept_test = entry.scenario in test_ids and entry.scenario in scan.kept
         if is_kept_test and not entry.twin_floor:
             unlimited_ids.append(entry.scenario)
-    keeper.fetch(unlimited_ids)
+    campaign.fetch(unlimited_ids)
 
-    tasks = _simulation_tasks(setup, scan.to_do)
+    # The longest first; a parallel device advances several together.
+    substeps = dict(zip(scan.to_do.scenarios, scan.to_do.substeps, strict=True))
+    ids = sorted(substeps, key=lambda scenario: (-substeps[scenario], scenario))
+    width = 1
+    if campaign.device is not Device.CPU:
+        width = max(1, BATCH_PARTICLES // size.particles)
+    items = []
+    for start in range(0, len(ids), width):
+        batch = ids[start : start + width]
+        items.append(_work_item(campaign, tuple(batch), _simulate_and_perturb))
     for scenario in unlimited_ids:
-        tasks.append(_perturbation_task(setup, scenario))
-    if not tasks:
+        items.append(_work_item(campaign, (scenario,), _perturb))
+    if not items:
         return
 
-    total = 0
-    for task in tasks:
-        total += round(task.cost)
-    for scenario in scan.to_do.scenarios:
-        if scenario in test_ids:
-            total += perturbed_substep_count(size, scenario)
-    scenario_count = len(scan.to_do.scenarios)
-    setup.meter.begin("simulating", total=total, scenarios=scenario_count)
-
-    with _open_team(setup, len(tasks)) as team:
-        for task in tasks:
-            team.submit(task)
-        for event in team.events():
-            if event.kind == "progress":
-                setup.meter.count(event.value)
-            elif event.kind == "lost":
-                setup.meter.count(-event.value)
-            elif event.item.function is measure_predictability:
-                _add_limits(keeper, event.value)
-            else:
-                _add_simulated(setup, keeper, event)
-                for simulated in event.value:
-                    if simulated.scenario in test_ids:
-                        task = _perturbation_task(setup, simulated.scenario)
-                        team.submit(task)
+    campaign.meter.begin(
+        "simulating", total=round(sum(item.cost for item in items)), scenarios=len(ids)
+    )
+    finished_items = run_items(
+        items,
+        workers=campaign.workers,
+        scheduler=campaign.scheduler,
+        environment=ONE_THREAD if campaign.device is Device.CPU else {},
+    )
+    with closing(finished_items):
+        for finished in finished_items:
+            campaign.meter.count(finished.units)
+            _add_simulated(campaign, finished)
 
 
-def _open_team(setup: _Setup, task_count: int) -> Pool | Cluster:
-    """Return the workers, here or of a Dask scheduler, to be used with ``with``."""
-    if setup.scheduler is not None:
-        return Cluster(setup.scheduler, folder=setup.folder)
-    environment: Mapping[str, str] = {}
-    if setup.device is Device.CPU:
-        environment = ONE_THREAD
-    return Pool(min(setup.workers, task_count), environment)
-
-
-def _simulation_tasks(setup: _Setup, to_do: Estimate) -> list[WorkItem]:
-    """Return a task per batch; scenarios of similar length share a batch."""
-    costs = dict(zip(to_do.scenarios, to_do.substeps, strict=True))
-    longest_first = sorted(costs, key=lambda scenario: (-costs[scenario], scenario))
-    width = 1
-    if setup.device is not Device.CPU:
-        width = max(1, BATCH_PARTICLES // setup.size.particles)
-
-    tasks = []
-    for start in range(0, len(longest_first), width):
-        ids = tuple(longest_first[start : start + width])
-        cost = sum(costs[scenario] for scenario in ids)
-        name = f"scenario {format_ids(ids)}"
-        tasks.append(_task(setup, name, function=simulate, ids=ids, cost=cost))
-    return tasks
-
-
-def _perturbation_task(setup: _Setup, scenario: int) -> WorkItem:
-    return _task(
-        setup,
-        f"perturbed run of scenario {scenario}",
-        function=measure_predictability,
-        ids=(scenario,),
-        cost=perturbed_substep_count(setup.size, scenario),
+def _work_item(
+    campaign: _Campaign,
+    scenarios: tuple[int, ...],
+    function: Callable[[SimulationJob, Report], _Simulated],
+) -> WorkItem:
+    size = campaign.size
+    cost = 0
+    for scenario in scenarios:
+        if function is _simulate_and_perturb:
+            cost += substep_count(size, scenario)
+        if size.subset_of(scenario) == "test":
+            cost += perturbed_substep_count(size, scenario)
+    job = SimulationJob(
+        size=size, scenarios=scenarios, root=campaign.root, device=campaign.device
+    )
+    return WorkItem(
+        name=f"{size.split} {size.name}, scenario {format_ids(scenarios)}",
+        function=function,
+        argument=job,
+        cost=cost,
     )
 
 
-def _task(
-    setup: _Setup,
-    name: str,
-    *,
-    function: Callable[..., Any],
-    ids: tuple[int, ...],
-    cost: float,
-) -> WorkItem:
-    size = setup.size
-    job = SimulationJob(size=size, scenarios=ids, root=setup.root, device=setup.device)
-    full_name = f"{size.split} {size.name}, {name}"
-    return WorkItem(name=full_name, function=function, arguments=(job,), cost=cost)
+class _Simulated(NamedTuple):
+    """What a worker has made."""
+
+    scenarios: tuple[int, ...]  # ids whose files it has written
+    limits: Mapping[int, Sequence[float]]  # predictability limits by id
 
 
-def _add_simulated(setup: _Setup, keeper: _ManifestKeeper, event: Event) -> None:
-    """Put scenarios that a worker has simulated into the manifest."""
-    simulated: Sequence[SimulatedScenario] = event.value
-    machine = event.machine or describe_machine(setup.device)
-    environment = {**machine, "device": setup.device.value}
-    is_promised = promises_bits(environment)
-    for result in simulated:
-        if is_promised:
-            keeper.promised.append(result.scenario)
-        if setup.scheduler is not None:
-            await_file(setup.path(result.scenario))
-    entries = []
-    for result in simulated:
-        entries.append(describe_file(setup.root, setup.size.key(result.scenario)))
-    record_entry_hashes(setup.folder, entries)
-    keeper.add(entries, environment)
-    setup.meter.count(scenarios=len(entries))
+def _simulate_and_perturb(job: SimulationJob, report: Report) -> _Simulated:
+    """Simulate scenarios, and perturbed runs of those of test."""
+    simulate(job, report)
+    limits: dict[int, Sequence[float]] = {}
+    for scenario in job.scenarios:
+        if job.size.subset_of(scenario) == "test":
+            single = replace(job, scenarios=(scenario,))
+            limits |= measure_predictability(single, report)
+    return _Simulated(job.scenarios, limits)
 
 
-def _add_limits(keeper: _ManifestKeeper, limits: Mapping[int, Sequence[float]]) -> None:
-    """Put predictability limits into the entries of their scenarios."""
-    entries = []
-    for entry in keeper.manifest.files:
-        if entry.scenario in limits:
-            rounded = tuple(map(round_digits, limits[entry.scenario]))
-            entries.append(entry.model_copy(update={"twin_floor": rounded}))
-    keeper.add(entries)
+def _perturb(job: SimulationJob, report: Report) -> _Simulated:
+    return _Simulated((), measure_predictability(job, report))
 
 
-def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
+def _add_simulated(campaign: _Campaign, finished: Finished) -> None:
+    """Put what a worker has made into the manifest."""
+    made: _Simulated = finished.value
+    entries = {}
+    for scenario in made.scenarios:
+        path = campaign.path(scenario)
+        end = time.monotonic() + FILE_SECONDS
+        while not path.is_file():
+            os.listdir(path.parents[1])  # makes a network file system look again
+            if time.monotonic() > end:
+                raise WorkFailedError(
+                    "a worker's file does not appear; name a folder on storage that "
+                    "all machines share, then run the same command again",
+                    where=str(path),
+                )
+            time.sleep(0.1)
+        entries[scenario] = describe_file(campaign.root, campaign.size.key(scenario))
+    record_entry_hashes(campaign.folder, entries.values())
+
+    for scenario, limit in made.limits.items():
+        entry = entries.get(scenario) or campaign.manifest.entry(scenario)
+        if entry is not None:
+            rounded = tuple(map(round_digits, limit))
+            entries[scenario] = entry.model_copy(update={"twin_floor": rounded})
+    environment = None
+    if made.scenarios:
+        environment = {**finished.machine, "device": campaign.device.value}
+        if promises_bits(environment):
+            campaign.promised += made.scenarios
+    campaign.keep(
+        merge_entries(campaign.size, campaign.manifest, entries.values(), environment)
+    )
+    campaign.meter.count(scenarios=len(made.scenarios))
+
+
+def _complete_statistics(campaign: _Campaign) -> None:
     """Put the statistics of train into the manifest, once train is complete."""
-    manifest = keeper.manifest
-    measured = setup.size.measured
+    manifest = campaign.manifest
+    measured = campaign.size.measured
     # Statistics of other bits differ from datasets.yaml by right.
     is_doubted = (
         measured is not None
         and manifest.identity == "bitwise"
         and manifest.statistics != measured.statistics
     )
-    is_needed = is_doubted or not has_all_statistics(manifest, setup.size)
+    is_needed = is_doubted or not has_all_statistics(manifest, campaign.size)
     if "train" in manifest.subset_sha256 and is_needed:
-        train_ids = setup.size.subsets["train"]
-        keeper.fetch(train_ids)
-        setup.meter.begin("statistics", total=len(train_ids), scenarios=len(train_ids))
+        train_ids = campaign.size.subsets["train"]
+        campaign.fetch(train_ids)
+        campaign.meter.begin(
+            "statistics", total=len(train_ids), scenarios=len(train_ids)
+        )
         paths = {}
         for i in train_ids:
-            paths[f"scenario {i}"] = setup.path(i)
-        read_moments = partial(file_moments, box=setup.size.box)
-        moments = setup.read_files(read_moments, paths, paths.values())
+            paths[f"scenario {i}"] = campaign.path(i)
+        read_moments = partial(file_moments, box=campaign.size.box)
+        moments = campaign.read_files(read_moments, paths, paths.values())
         manifest = manifest.model_copy(update={"statistics": statistics(moments)})
-    keeper.keep(manifest)
+    campaign.keep(manifest)
 
 
-def _describe(setup: _Setup, store: Publication | None, manifest: Manifest) -> None:
-    """Write the cards, and bring the store to the state of the folder.
-
-    Scenarios of a blind test have no card: it would say how to make the public ones.
-    """
-    size = setup.size
-    if size.draw_seed is not None:
-        return
-    setup.meter.begin("cards", total=1, scenarios=len(manifest.files))
-    if store is None:
-        write_cards(setup.root, size, setup.split, manifest)
-        return
-
-    if store.is_settled(manifest, card_texts(size, setup.split, manifest)):
-        return
-    store.fetch(size.scenarios)
-    cards = write_cards(setup.root, size, setup.split, manifest)
-    store.finish(manifest, cards)
+def _is_settled(campaign: _Campaign, scan: _Scan) -> bool:
+    """Return whether a store has all that there is, its cards too."""
+    store = campaign.store
+    return store is not None and not scan.to_do.scenarios and store.has_card()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import enum
 import shlex
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -108,23 +109,23 @@ def overview(size: Size, root: Path) -> Overview:
 
     seconds = 0.0
     if size.simulated:
-        expected = estimate(size, ids)
-        seconds = expected.seconds(available_cores())
+        seconds = estimate(size, ids).seconds(available_cores())
+    url = url_of(root)
+    if url is None:
+        present_ids = {i for i in ids if has_file(size.path(root, i))}
+    else:
+        # what a store takes is not loaded for a folder
+        from lagbench.store.copy import remote_manifest
 
-    present_ids = _present_scenarios(size, root)
+        manifest = remote_manifest(size, url)
+        entries = manifest.files if manifest else ()
+        present_ids = {entry.scenario for entry in entries}
     counts: dict[str, int] = {}
     present: dict[str, int] = {}
     for subset, members in size.subsets.items():
         counts[subset] = len(members)
         present[subset] = len(present_ids.intersection(members))
-
-    picture = None
-    for name in PICTURES:
-        if picture is None and has_file(folder / name):
-            picture = folder / name
-    dataset_sha256 = None
-    if size.measured:
-        dataset_sha256 = size.measured.dataset_sha256
+    pictures = [folder / name for name in PICTURES if has_file(folder / name)]
     return Overview(
         split=size.split,
         size=size.name,
@@ -136,24 +137,9 @@ def overview(size: Size, root: Path) -> Overview:
         seconds=seconds,
         present=present,
         folder=folder,
-        picture=picture,
-        dataset_sha256=dataset_sha256,
+        picture=pictures[0] if pictures else None,
+        dataset_sha256=size.measured.dataset_sha256 if size.measured else None,
     )
-
-
-def _present_scenarios(size: Size, root: Path) -> set[int]:
-    """Return the ids whose files a folder has, or that its store's manifest names."""
-    url = url_of(root)
-    if url is None:
-        return {i for i in size.scenarios if has_file(size.path(root, i))}
-
-    # what a store takes is not loaded for a folder
-    from lagbench.store.copy import remote_manifest
-
-    manifest = remote_manifest(size, url)
-    if manifest is None:
-        return set()
-    return {entry.scenario for entry in manifest.files}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,9 +215,7 @@ def _inspect_file(
 ) -> ScenarioInspection:
     """Inspect a file that is there; one that is not right is a DataError."""
     path = size.path(root, scenario)
-    claim = None
-    if manifest:
-        claim = manifest.entry(scenario)
+    claim = manifest.entry(scenario) if manifest else None
 
     # A manifest is the word of whoever wrote it: only what was hashed here is not
     # hashed again.
@@ -248,30 +232,67 @@ def _inspect_file(
         noted_content = claim.content_sha256
 
     with read_scenario(path) as file:
-        _check_key(path, file.header, size, scenario)
+        key = file.header.key
+        stated_key = (key.split, key.size, key.major, key.scenario, key.subset)
+        subset = size.subset_of(scenario)
+        expected_key = (size.split, size.name, size.major, scenario, subset)
+        if stated_key != expected_key:
+            raise DataError(
+                f"a file holds another scenario: got {stated_key}, expected "
+                f"{expected_key}",
+                where=str(path),
+            )
         different_parameters = _list_different_parameters(file.header, size, scenario)
         if noted_content and not different_parameters:
             file.check_attributes()
+    recorded = recorded_hash(size, scenario)
+    content = noted_content
     if different_parameters:
         # The content hash covers the parameters. So a file with the recorded hash is
         # right, whatever the module of the split draws today.
-        noted_content = _find_recorded_content(path, size, scenario)
-        if noted_content is None:
+        content = None
+        if recorded is not None:
+            with suppress(DataError):
+                content = check_scenario(path)
+        if content is None or not content.startswith(recorded or "?"):
             raise DataError(
                 "a file was simulated with other parameters: expected those of "
                 f"{size.record_name}, and of {size.generator}",
                 where=f"{path}, attributes {', '.join(different_parameters)}",
             )
-    content = noted_content or check_scenario(path)
+    content = content or check_scenario(path)
 
-    is_tolerated = _check_content(
-        size, scenario, content=content, manifest=manifest, path=path
-    )
+    expected = recorded or (claim.content_sha256 if claim else "")
+    is_tolerated = False
+    if not content.startswith(expected):
+        # A machine may have written it that promises no equal bits.
+        is_tolerated = (
+            manifest is not None
+            and manifest.identity == "tolerance"
+            and claim is not None
+            and claim.content_sha256 == content
+            and may_differ(claim.device, manifest.environments)
+        )
+        if not is_tolerated:
+            source = size.record_name if recorded else "the manifest"
+            raise DataError(
+                f"the file has another content hash: got {content}, expected "
+                f"{expected} of {source}",
+                where=str(path),
+            )
     entry = None
     if quick and digest is not None:
-        entry = _entry_of(
-            root, size, scenario, claim=claim, content=content, digest=digest
-        )
+        has_same_content = claim is not None and claim.content_sha256 == content
+        entry = claim
+        if claim is None or not has_same_content or claim.file_sha256 != digest:
+            entry = describe_file(root, size.key(scenario), digest=digest)
+            if claim is not None and has_same_content:
+                # packed anew, or by an earlier version
+                update = {
+                    "facts": entry.facts or claim.facts,
+                    "twin_floor": claim.twin_floor,
+                }
+                entry = entry.model_copy(update=update)
     return ScenarioInspection(
         scenario=scenario,
         state=DataSetState.GOOD,
@@ -279,69 +300,6 @@ def _inspect_file(
         entry=entry,
         tolerated=is_tolerated,
     )
-
-
-def _check_content(
-    size: Size,
-    scenario: int,
-    *,
-    content: str,
-    manifest: Manifest | None,
-    path: Path,
-) -> bool:
-    """Refuse a content hash that is not the recorded one, else the manifest's.
-
-    Returns:
-        Whether it differs and is tolerated: a machine wrote the file that promises no
-        equal bits.
-    """
-    claim = None
-    if manifest:
-        claim = manifest.entry(scenario)
-    expected = recorded_hash(size, scenario)
-    source = size.record_name
-    if expected is None and claim is not None:
-        expected = claim.content_sha256
-        source = "the manifest"
-    if expected is None or content.startswith(expected):
-        return False
-
-    is_tolerated = (
-        manifest is not None
-        and manifest.identity == "tolerance"
-        and claim is not None
-        and claim.content_sha256 == content
-        and may_differ(claim.device, manifest.environments)
-    )
-    if not is_tolerated:
-        raise DataError(
-            f"the file has another content hash: got {content}, expected {expected} "
-            f"of {source}",
-            where=str(path),
-        )
-    return True
-
-
-def _entry_of(
-    root: Path,
-    size: Size,
-    scenario: int,
-    *,
-    claim: FileEntry | None,
-    content: str,
-    digest: str,
-) -> FileEntry:
-    """Return the manifest entry of a good file with these hashes."""
-    has_same_content = claim is not None and claim.content_sha256 == content
-    if claim is not None and has_same_content and claim.file_sha256 == digest:
-        return claim
-
-    entry = describe_file(root, size.key(scenario), digest=digest)
-    if claim is not None and has_same_content:
-        # packed anew, or by an earlier version
-        update = {"facts": entry.facts or claim.facts, "twin_floor": claim.twin_floor}
-        entry = entry.model_copy(update=update)
-    return entry
 
 
 def run_inspection(
@@ -356,43 +314,12 @@ def run_inspection(
 def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
     """Return, by subset folder, the names of files that no scenario of the size has."""
     folder = size.folder(root)
-    scenario_names = set()
-    for subset, ids in size.subsets.items():
-        for scenario in ids:
-            scenario_names.add((subset, f"{scenario:04d}.nc"))
-
+    known_paths = {size.path(root, scenario) for scenario in size.scenarios}
     extra: dict[str, list[str]] = {}
     for path in sorted(folder.glob("*/*.nc")):
-        subset = path.parent.name
-        is_hidden = path.name.startswith(".")
-        if (subset, path.name) not in scenario_names and not is_hidden:
-            extra.setdefault(subset, []).append(path.name)
+        if path not in known_paths and not path.name.startswith("."):
+            extra.setdefault(path.parent.name, []).append(path.name)
     return extra
-
-
-def _check_key(path: Path, header: ScenarioHeader, size: Size, scenario: int) -> None:
-    """Refuse a file of another scenario."""
-    key = header.key
-    stated_key = (key.split, key.size, key.major, key.scenario, key.subset)
-    subset = size.subset_of(scenario)
-    expected_key = (size.split, size.name, size.major, scenario, subset)
-    if stated_key != expected_key:
-        raise DataError(
-            f"a file holds another scenario: got {stated_key}, expected {expected_key}",
-            where=str(path),
-        )
-
-
-def _find_recorded_content(path: Path, size: Size, scenario: int) -> str | None:
-    """Return the content hash of a whole file if it is the recorded one, else None."""
-    recorded = recorded_hash(size, scenario)
-    if recorded is None:
-        return None
-    try:
-        content = check_scenario(path)
-    except DataError:
-        return None
-    return content if content.startswith(recorded) else None
 
 
 def _list_different_parameters(
@@ -419,11 +346,8 @@ def _list_different_parameters(
     if "periodic" in stated:  # in any order
         stated["periodic"] = " ".join(sorted(str(stated["periodic"]).split()))
 
-    different_parameters = []
-    for name in sorted(expected.keys() | stated.keys()):
-        if expected.get(name) != stated.get(name):
-            different_parameters.append(name)
-    return different_parameters
+    names = sorted(expected.keys() | stated.keys())
+    return [name for name in names if expected.get(name) != stated.get(name)]
 
 
 def compare_hashes(
@@ -526,7 +450,12 @@ def hash_verdict(
     """Return how the hash of a subset, else of the data set, compares with the recorded
     one, in words.
     """
-    recorded = _recorded_digest(size, subset)
+    measured = size.measured
+    recorded = None
+    if measured is not None:
+        recorded = measured.dataset_sha256
+        if subset is not None:
+            recorded = measured.subset_sha256.get(subset)
     if recorded is None:
         return f"no hash in {size.record_name} yet"
     if computed is None:
@@ -536,12 +465,3 @@ def hash_verdict(
     if tolerated:
         return other_bits(size)
     return unlike(size)
-
-
-def _recorded_digest(size: Size, subset: str | None) -> str | None:
-    """Return the recorded hash of a subset, of the data set where it is None."""
-    if size.measured is None:
-        return None
-    if subset is None:
-        return size.measured.dataset_sha256
-    return size.measured.subset_sha256.get(subset)

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.field_errors import describe_value
 from lagbench.data.layout import (
     MAX_ID,
     format_ids,
@@ -43,82 +42,41 @@ def select(
     Raises:
         UsageError: an unknown subset, an id outside the subsets, or no id at all.
     """
-    names = _subset_names(size, subset)
-    selectable: set[int] = set()
-    for name in names:
-        selectable.update(size.subsets[name])
-    if scenarios is None:
-        return tuple(sorted(selectable))
-
-    ids = _scenario_ids(scenarios)
-    unknown = []
-    for scenario in ids:
-        if scenario not in selectable:
-            unknown.append(scenario)
-    if unknown or not ids:
-        choices = []
-        for name in names:
-            choices.append(f"{name} {format_ids(size.subsets[name])}")
-        # Without any id the message reads "no scenario at all in test".
-        missing = format_ids(unknown) or "at all"
-        raise UsageError(
-            f"no scenario {missing} in {', '.join(names)}: got "
-            f"{format_ids(ids) or 'none'}, expected {'; '.join(choices)}; name ids of "
-            "these, or leave --scenarios out to take all",
-            where=f"--scenarios, {size.split} {size.name}",
-        )
-    return tuple(sorted(set(ids)))
-
-
-def _subset_names(size: Size, subset: Selection) -> tuple[str, ...]:
     if isinstance(subset, str):
         subset = subset.replace(" ", "").split(",")
-    names = tuple(size.subsets)
-    if subset is not None:
-        names = tuple(subset)
-    if not names:
-        raise UsageError(
-            "no subset is named: got an empty list, expected "
-            f"{', '.join(size.subsets)}; name one of these, or leave it out to take "
-            "all",
-            where="--subset",
-        )
+    names = tuple(size.subsets) if subset is None else tuple(subset)
+    selectable: set[int] = set()
     for name in names:
         if name not in size.subsets:
             raise UsageError(
-                f"{size.split} {size.name} has no subset {name!r}: expected "
-                f"{', '.join(size.subsets)}; {suggest_name(name, size.subsets)}",
+                f"{size.split} {size.name} has no subset {name!r}; "
+                f"{suggest_name(name, size.subsets)}",
                 where="--subset",
             )
-    return names
-
-
-def _scenario_ids(scenarios: str | Iterable[int]) -> tuple[int, ...]:
-    try:
-        if isinstance(scenarios, str):
-            return parse_ids(scenarios)
-        # one more than there can be: a range or an iterator may go on for ever
-        first_numbers = itertools.islice(scenarios, MAX_ID + 2)
-        ids = tuple(map(operator.index, first_numbers))
-    except TypeError:
-        raise UsageError(
-            f"no ids: {repr(scenarios)[:80]}; give a text, or whole numbers in a list",
-            where="--scenarios",
-        ) from None
-    if len(ids) > MAX_ID + 1:
-        raise UsageError(
-            f"more ids than scenarios can have: got {repr(scenarios)[:80]}, expected "
-            f"at most {MAX_ID + 1} ids, from 0 to {MAX_ID}; name fewer",
-            where="--scenarios",
-        )
-    for scenario in ids:
-        if abs(scenario) > MAX_ID:
+        selectable.update(size.subsets[name])
+    if scenarios is None:
+        ids = selectable
+    elif isinstance(scenarios, str):
+        ids = set(parse_ids(scenarios))
+    else:
+        try:
+            # a range or an iterator may go on for ever
+            ids = set(map(operator.index, itertools.islice(scenarios, MAX_ID + 2)))
+        except TypeError:
             raise UsageError(
-                f"a number is too large for an id: got {describe_value(scenario)}, "
-                f"expected ids from 0 to {MAX_ID}; name ids that `lagbench info` lists",
+                f"no ids: {scenarios!r:.80}; give a text, or whole numbers in a list",
                 where="--scenarios",
-            )
-    return ids
+            ) from None
+    unknown = sorted(ids - selectable)
+    if unknown or not ids:
+        choices = [f"{name} {format_ids(size.subsets[name])}" for name in names]
+        # Without any id the message reads "no scenario at all in test".
+        raise UsageError(
+            f"no scenario {format_ids(unknown[:100]) or 'at all'} in "
+            f"{', '.join(names)}; there are {'; '.join(choices)}",
+            where=f"--scenarios, {size.split} {size.name}",
+        )
+    return tuple(sorted(ids))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,19 +150,13 @@ def free_bytes(folder: Path) -> int:
     """
     places = (folder, *folder.parents)
     existing = next(place for place in places if os.path.lexists(place))
-    if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
-        return shutil.disk_usage(existing).free
-
-    obstacle = "a file"
-    if existing.is_dir():
-        obstacle = "write-protected"
-    elif existing.is_symlink():
-        obstacle = "a link that leads to no folder"
-    raise WorkFailedError(
-        f"no data set can be written here: {existing} is {obstacle}; name another "
-        "folder: --root or LAGBENCH_ROOT",
-        where=str(folder),
-    )
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise WorkFailedError(
+            f"no data set can be written here: {existing} is no folder or "
+            "write-protected; name another folder: --root or LAGBENCH_ROOT",
+            where=str(folder),
+        )
+    return shutil.disk_usage(existing).free
 
 
 def check_disk(root: Path, needed: int) -> None:

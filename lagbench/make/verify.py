@@ -29,9 +29,9 @@ from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.split import Device
-from lagbench.store.copy import list_unstored, update_working_copy
+from lagbench.store.copy import update_working_copy
+from lagbench.work.executor import WorkItem, run_items
 from lagbench.work.machine import worker_count
-from lagbench.work.pool import Pool, WorkItem
 from lagbench.work.run import Meter, Progress
 
 from .inventory import (
@@ -45,9 +45,6 @@ from .inventory import (
     unlike,
 )
 from .plan import Scenarios, Selection, estimate, select
-
-Inspections = Mapping[int, ScenarioInspection]
-"""What the inspection of each scenario's file showed, by id."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,48 +161,74 @@ def verify(
         check_installed("taichi", extra="generate")
 
     update_working_copy(tier, data_root, ids, thoroughly=True)
-    manifest, warnings = _read_manifest(tier, data_root)
+    manifest = None
+    warnings = [f"there is no manifest: {suggest_repair(tier, root=data_root)}"]
+    try:
+        manifest = read_manifest(data_root, tier.split, tier.name, tier.major)
+    except DataError as error:
+        warnings = [str(error)]
+    if manifest is not None:
+        warnings = []
+        if manifest.identity == "tolerance":
+            warnings.append(
+                "identity: tolerance - a device wrote these files that does not "
+                "promise equal bits"
+            )
+
     inspections = _inspect_files(tier, data_root, ids, manifest=manifest, meter=meter)
     # content hashes of the files that are there and right
     hashes: dict[int, str] = {}
+    problems = []
+    tolerated = []
     for scenario, inspection in inspections.items():
         if inspection.content_sha256:
             hashes[scenario] = inspection.content_sha256
-
-    new_hashes = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
-    regenerated: dict[int, str] = {}
-    for scenario, content in new_hashes.items():
-        regenerated[scenario] = _compare_regenerated(
-            tier, inspections[scenario], content
-        )
-
-    subset_digests = _subset_digests(tier, hashes)
-    data_set_digest = _data_set_digest(tier, subset_digests)
-    reports = _subset_reports(data_root, tier, inspections, subset_digests)
-    tolerated = []
-    for i, inspection in inspections.items():
+        if inspection.problem:
+            problems.append(inspection.problem)
         if inspection.tolerated:
-            tolerated.append(i)
+            tolerated.append(scenario)
+
+    regenerated: dict[int, str] = {}
+    chosen = evenly_spaced(ids, regenerate)
+    for scenario, content in _regenerate(tier, chosen, cores, meter).items():
+        verdict = _compare_regenerated(tier, inspections[scenario], content)
+        regenerated[scenario] = verdict
+        if verdict == "different":
+            problems.append(f"scenario {scenario} differs when simulated anew")
+
+    # hashes of the subsets whose files are all there and right
+    digests = {}
+    for name, members in tier.subsets.items():
+        if hashes.keys() >= set(members):
+            digests[name] = subset_hash({i: hashes[i] for i in members})
+    data_set_digest = None
+    if digests.keys() >= set(HASHED_SUBSETS):
+        covered = {name: digests[name] for name in HASHED_SUBSETS}
+        data_set_digest = dataset_hash(tier.split, tier.name, tier.major, covered)
+    reports = _subset_reports(data_root, tier, inspections, digests)
     verdict = hash_verdict(tier, data_set_digest, tolerated=bool(tolerated))
 
-    problems = [*_file_problems(inspections), *_regeneration_problems(regenerated)]
-    # A killed writer leaves files here that the store never got.
-    for scenario in list_unstored(tier, data_root, [*hashes]):
-        problem = f"scenario {scenario} is in the working copy alone, not in the store"
-        problems.append(problem)
-    problems += _hash_problems(tier, reports, verdict)
-
-    warnings += _gaps(tier, reports, tolerated)
-    warnings += _manifest_differences(tier, manifest, inspections)
-    identity = "unknown"
-    if manifest:
-        identity = manifest.identity
+    wrong = unlike(tier)
+    for report in reports:
+        if report.verdict == wrong:
+            problems.append(f"{report.name}: its hash is {wrong}")
+        if report.missing:
+            warnings.append(f"{report.name} lacks {format_ids(report.missing)}")
+        if report.extra:
+            names = ", ".join(report.extra)
+            warnings.append(f"{report.name} has files of no scenario: {names}")
+    if verdict == wrong:
+        problems.append(f"the data set hash is {wrong}")
+    if tolerated:
+        warnings.append(f"scenarios {format_ids(tolerated)} have {other_bits(tier)}")
+    if manifest is not None:
+        warnings += _manifest_differences(tier, manifest, hashes)
     return VerificationResult(
         split=tier.split,
         size=tier.name,
         folder=tier.folder(data_root),
         subsets=reports,
-        identity=identity,
+        identity=manifest.identity if manifest else "unknown",
         dataset_sha256=data_set_digest,
         regenerated=regenerated,
         problems=tuple(problems),
@@ -214,24 +237,6 @@ def verify(
         verdict=verdict,
         fix=suggest_repair(tier, root=data_root),
     )
-
-
-def _read_manifest(size: Size, root: Path) -> tuple[Manifest | None, list[str]]:
-    """Return the manifest of a data set, and what a reader should know of it."""
-    try:
-        manifest = read_manifest(root, size.split, size.name, size.major)
-    except DataError as error:
-        return None, [str(error)]
-    if manifest is None:
-        return None, [f"there is no manifest: {suggest_repair(size, root=root)}"]
-
-    warnings = []
-    if manifest.identity == "tolerance":
-        warnings.append(
-            "identity: tolerance - a device wrote these files that does not "
-            "promise equal bits"
-        )
-    return manifest, warnings
 
 
 def _inspect_files(
@@ -291,28 +296,20 @@ def _regenerate(
     substeps = estimate(size, ids).substeps
     meter.begin("simulating anew", total=sum(substeps), scenarios=len(ids))
     hashes: dict[int, str] = {}
-    with (
-        tempfile.TemporaryDirectory(prefix="lagbench-") as folder,
-        Pool(min(workers, len(ids))) as pool,
-    ):
+    with tempfile.TemporaryDirectory(prefix="lagbench-") as folder:
+        items = []
         for scenario, cost in zip(ids, substeps, strict=True):
             job = SimulationJob(
                 size=size, scenarios=(scenario,), root=Path(folder), device=Device.CPU
             )
             name = f"{size.split} {size.name}, scenario {scenario}"
-            pool.submit(
-                WorkItem(name=name, function=simulate, arguments=(job,), cost=cost)
+            items.append(
+                WorkItem(name=name, function=simulate, argument=job, cost=cost)
             )
-        for event in pool.events():
-            if event.kind == "done":
-                for simulated in event.value:
-                    hashes[simulated.scenario] = simulated.content_sha256
-                meter.count(scenarios=1)
-            elif event.kind == "progress":
-                meter.count(event.value)
-            else:
-                # lost with its worker: done in vain
-                meter.count(-event.value)
+        for finished in run_items(items, workers=workers):
+            for simulated in finished.value:
+                hashes[simulated.scenario] = simulated.content_sha256
+            meter.count(finished.units, scenarios=1)
     return {scenario: hashes[scenario] for scenario in ids}
 
 
@@ -335,149 +332,64 @@ def _compare_regenerated(
     return "different"
 
 
-def _subset_digests(size: Size, hashes: Mapping[int, str]) -> dict[str, str]:
-    """Return the hash of every subset whose files are all there and right."""
-    digests = {}
-    for name, members in size.subsets.items():
-        if hashes.keys() >= set(members):
-            digests[name] = subset_hash({i: hashes[i] for i in members})
-    return digests
-
-
-def _data_set_digest(size: Size, subset_digests: Mapping[str, str]) -> str | None:
-    """Return the hash of a data set; None while a subset that it covers has none."""
-    covered = {}
-    for name in HASHED_SUBSETS:
-        if name not in subset_digests:
-            return None
-        covered[name] = subset_digests[name]
-    return dataset_hash(size.split, size.name, size.major, covered)
-
-
 def _subset_reports(
-    root: Path, size: Size, inspections: Inspections, digests: Mapping[str, str]
+    root: Path,
+    size: Size,
+    inspections: Mapping[int, ScenarioInspection],
+    digests: Mapping[str, str],
 ) -> tuple[SubsetReport, ...]:
     extra = extra_files(root, size)
     reports = []
     for name, members in size.subsets.items():
-        subset_inspections = []
-        for i in members:
-            if i in inspections:
-                subset_inspections.append(inspections[i])
-        if not subset_inspections:
+        is_tolerated = False
+        ids: dict[DataSetState, list[int]] = {state: [] for state in DataSetState}
+        for scenario in members:
+            if scenario in inspections:
+                inspection = inspections[scenario]
+                is_tolerated |= inspection.tolerated
+                ids[inspection.state].append(scenario)
+        if not any(ids.values()):
             continue
-        is_tolerated = any(inspection.tolerated for inspection in subset_inspections)
-        verdict = hash_verdict(size, digests.get(name), name, tolerated=is_tolerated)
         report = SubsetReport(
             name=name,
-            present=len(_ids_in_state(subset_inspections, DataSetState.GOOD)),
-            missing=_ids_in_state(subset_inspections, DataSetState.MISSING),
-            wrong=_ids_in_state(subset_inspections, DataSetState.WRONG),
+            present=len(ids[DataSetState.GOOD]),
+            missing=tuple(ids[DataSetState.MISSING]),
+            wrong=tuple(ids[DataSetState.WRONG]),
             extra=tuple(extra.get(name, ())),
-            verdict=verdict,
+            verdict=hash_verdict(size, digests.get(name), name, tolerated=is_tolerated),
         )
         reports.append(report)
     return tuple(reports)
 
 
-def _ids_in_state(
-    inspections: Sequence[ScenarioInspection], state: DataSetState
-) -> tuple[int, ...]:
-    scenarios = []
-    for inspection in inspections:
-        if inspection.state is state:
-            scenarios.append(inspection.scenario)
-    return tuple(scenarios)
-
-
-def _file_problems(inspections: Inspections) -> list[str]:
-    problems = []
-    for inspection in inspections.values():
-        if inspection.problem:
-            problems.append(inspection.problem)
-    return problems
-
-
-def _regeneration_problems(regenerated: Mapping[int, str]) -> list[str]:
-    problems = []
-    for scenario, verdict in regenerated.items():
-        if verdict == "different":
-            problems.append(f"scenario {scenario} differs when simulated anew")
-    return problems
-
-
-def _hash_problems(
-    size: Size, reports: Sequence[SubsetReport], verdict: str
-) -> list[str]:
-    """Return which hashes are not the recorded ones."""
-    wrong = unlike(size)
-    problems = []
-    for report in reports:
-        if report.verdict == wrong:
-            problems.append(f"{report.name}: its hash is {wrong}")
-    if verdict == wrong:
-        problems.append(f"the data set hash is {wrong}")
-    return problems
-
-
-def _gaps(
-    size: Size, reports: Sequence[SubsetReport], tolerated: Sequence[int]
-) -> list[str]:
-    """Return what is tolerated, missing, or there without a scenario."""
-    gaps = []
-    if tolerated:
-        gaps.append(f"scenarios {format_ids(tolerated)} have {other_bits(size)}")
-    for report in reports:
-        if report.missing:
-            gaps.append(f"{report.name} lacks {format_ids(report.missing)}")
-    for report in reports:
-        if report.extra:
-            names = ", ".join(report.extra)
-            gaps.append(f"{report.name} has files of no scenario: {names}")
-    return gaps
-
-
 def _manifest_differences(
-    size: Size, manifest: Manifest | None, inspections: Inspections
+    size: Size, manifest: Manifest, hashes: Mapping[int, str]
 ) -> list[str]:
     """Return how the manifest differs from files that are right, and from
     datasets.yaml.
     """
-    if manifest is None:
-        return []
     differences = []
     different_ids = []
-    for scenario, inspection in inspections.items():
+    for scenario, content in hashes.items():
         entry = manifest.entry(scenario)
-        content = inspection.content_sha256
-        if entry and content and content != entry.content_sha256:
+        if entry and content != entry.content_sha256:
             different_ids.append(scenario)
     if different_ids:
         listing = format_ids(different_ids)
         differences.append(f"the manifest has other hashes of {listing}")
 
-    names = _different_statistics(size, manifest)
-    if names:
-        listing = ", ".join(names)
-        record = size.record_name
-        differences.append(f"the manifest has another {listing} than {record}")
-    return differences
-
-
-def _different_statistics(size: Size, manifest: Manifest) -> list[str]:
-    """Return the names of recorded numbers of which the manifest has others.
-
-    They follow from the bits. So they must be as recorded where all bits are.
-    """
+    # Statistics follow from the bits: they must be as recorded where all bits are.
     is_bitwise = manifest.complete and manifest.identity == "bitwise"
-    if size.measured is None or not is_bitwise:
-        return []
-    stated = manifest.statistics
-    recorded = size.measured.statistics
-    names = []
-    for name in sorted(stated.keys() | recorded.keys()):
-        if stated.get(name) != recorded.get(name):
-            names.append(name)
-    if manifest.mean_twin_floor() != size.measured.twin_floor:
-        names.append("twin_floor")
-    return names
+    if size.measured is not None and is_bitwise:
+        names = []
+        recorded = size.measured.statistics
+        for name in sorted(manifest.statistics.keys() | recorded.keys()):
+            if manifest.statistics.get(name) != recorded.get(name):
+                names.append(name)
+        if manifest.mean_twin_floor() != size.measured.twin_floor:
+            names.append("twin_floor")
+        if names:
+            listing = ", ".join(names)
+            record = size.record_name
+            differences.append(f"the manifest has another {listing} than {record}")
+    return differences

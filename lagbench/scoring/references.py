@@ -27,7 +27,7 @@ from lagbench.references.predictor import ReferencePredictor, given_in
 from lagbench.references.shipped import ReferenceScores, correlation_of
 from lagbench.references.table import REFERENCES, references_of
 from lagbench.store.copy import update_working_copy
-from lagbench.work.pool import Report
+from lagbench.work.executor import Report
 from lagbench.work.run import Meter, Progress, run_all
 
 from .scenario import measure_rows, predict_reference

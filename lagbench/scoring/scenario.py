@@ -24,7 +24,7 @@ from lagbench.references.predictor import (
     ReferencePredictor,
 )
 from lagbench.store.copy import update_working_copy
-from lagbench.work.pool import Report
+from lagbench.work.executor import Report
 
 from .flags import Trace, Tracer
 

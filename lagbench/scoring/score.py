@@ -46,8 +46,8 @@ from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.submission.validation import require_split, validate
+from lagbench.work.executor import Report
 from lagbench.work.machine import available_cores, worker_count
-from lagbench.work.pool import Report
 from lagbench.work.run import Meter, Progress, run_all
 
 from .card import JSON_NAME, ScoreCard, format_scores

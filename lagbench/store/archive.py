@@ -109,34 +109,16 @@ def write_archive(
 
 def _read_complete_manifest(size: Size, root: Path) -> Manifest:
     """Return the manifest of a data set with all scenarios and the recorded hash."""
-    where = str(size.folder(root))
     manifest = read_manifest(root, size.split, size.name, size.major)
-    present: list[int] = []
-    if manifest is not None:
-        present = [entry.scenario for entry in manifest.files]
-    if manifest is None or present != list(size.scenarios):
-        missing = set(size.scenarios).difference(present)
-        got = f"{len(present)} scenarios"
-        if missing:
-            got += f"; missing: {format_ids(sorted(missing))}"
+    present = [entry.scenario for entry in manifest.files] if manifest else []
+    recorded_hash = size.measured.dataset_sha256 if size.measured else None
+    is_whole = manifest is not None and present == list(size.scenarios)
+    if manifest is None or not is_whole or manifest.dataset_sha256 != recorded_hash:
         raise DataError(
-            f"the data set is not complete, or has other scenarios: got {got}, "
-            f"expected a manifest with scenarios {format_ids(size.scenarios)}; "
-            f"{suggest_repair(size, root=root)}",
-            where=where,
-        )
-    if size.measured is None:
-        raise DataError(
-            "the hash of the data set is not recorded; record the data set first: "
-            "docs/extending.md",
-            where=f"{size.record_name}, {size.split} {size.name}",
-        )
-    recorded_hash = size.measured.dataset_sha256
-    if manifest.dataset_sha256 != recorded_hash:
-        raise DataError(
-            f"the data set has another hash: got {manifest.dataset_sha256}, expected "
-            f"data set hash {recorded_hash}; {suggest_repair(size, root=root)}",
-            where=where,
+            f"no complete data set with the recorded hash {recorded_hash}: the "
+            f"manifest names scenarios {format_ids(present) or 'none'} of "
+            f"{format_ids(size.scenarios)}; {suggest_repair(size, root=root)}",
+            where=str(size.folder(root)),
         )
     return manifest
 

@@ -1,8 +1,12 @@
-"""Fetch scenarios into a working copy from its store, or gather them from other roots.
+"""Fetch scenarios into a working copy from its store, write them to it, or gather them
+from other root folders.
 
 The store's manifest names its objects. A fetched object gets its name once its content
 hash is that of datasets.yaml, or of the manifest where datasets.yaml has none.
 Files of the working copy that match the manifest are not fetched again.
+
+There is no lock on a store: every writer of a scenario writes the same bits, an object
+is put before the manifest names it, and each new manifest keeps the entries of others.
 """
 
 from __future__ import annotations
@@ -18,7 +22,13 @@ from pydantic import ValidationError
 
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, format_ids, has_file, url_of
+from lagbench.data.layout import (
+    CARD_NAME,
+    MANIFEST_NAME,
+    format_ids,
+    has_file,
+    url_of,
+)
 from lagbench.data.local import suggest_repair
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -38,7 +48,6 @@ from lagbench.work.machine import may_differ
 
 from .fetch import FetchRequest, fetch_scenarios
 from .objects import (
-    HTTP,
     NotInStoreError,
     Objects,
     WrongContentError,
@@ -146,7 +155,7 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
 
 def update_working_copy(
     size: Size, root: Path, scenarios: Iterable[int] = (), *, thoroughly: bool = False
-) -> bool:
+) -> None:
     """Fetch the manifest and some scenarios, where the root is a working copy.
 
     The caller has to miss the file of a scenario that the store does not have.
@@ -155,27 +164,18 @@ def update_working_copy(
         size: the data set.
         root: root folder; for a plain folder nothing happens.
         scenarios: scenarios to fetch.
-        thoroughly: hash files of the copy, and do not only compare their lengths; check
-            that the store has all objects of its manifest.
-
-    Returns:
-        Whether the copy has changed.
+        thoroughly: hash files of the copy, and do not only compare their lengths.
 
     Raises:
         DataError: the store holds wrong data.
         WorkFailedError: the store does not answer.
     """
     url = url_of(root)
-    scenarios = tuple(scenarios)
     if url is None or root in _copies_of_writers:
-        return False
-    manifest = _remote_manifest_with(size, url, scenarios)
+        return
+    manifest = remote_manifest(size, url)
     if manifest is None:
-        return False
-    # A store that answers HTTP lists nothing.
-    if thoroughly and not url.startswith(HTTP):
-        _check_objects(size, url, manifest)
-
+        return
     entries = []
     foreign_scenarios = []
     for scenario in scenarios:
@@ -184,66 +184,19 @@ def update_working_copy(
             entries.append(entry)
             if not matches_registry(entry, size, manifest):
                 foreign_scenarios.append(scenario)
-    refuse_foreign_hashes(
-        size,
-        manifest,
-        foreign_scenarios,
-        where=object_address(size, url, MANIFEST_NAME),
-    )
+    where = object_address(size, url, MANIFEST_NAME)
+    refuse_foreign_hashes(size, manifest, foreign_scenarios, where=where)
 
     local_manifest = read_or_empty(size, root)
     trusted = None if thoroughly else local_manifest
-    lacking = _list_lacking(entries, size, root, trusted)
-    if not lacking and add_local_entries(size, root, manifest) == local_manifest:
-        return False
+    lacking = [e for e in entries if not is_in_copy(e, size, root, trusted)]
+    if not lacking and manifest == local_manifest:
+        return
     with dataset_lock(root, size.split, size.name, size.major):
         # Another process may have fetched some meanwhile.
-        fetch_entries(size, root, url, _list_lacking(lacking, size, root))
-        write_manifest(root, add_local_entries(size, root, manifest))
-    return True
-
-
-def _remote_manifest_with(
-    size: Size, url: str, scenarios: Collection[int]
-) -> Manifest | None:
-    """Return a store's manifest; None where the store has none.
-
-    The store is asked again where the first answer lacks a scenario or is None.
-    """
-    manifest = remote_manifest(size, url)
-    if manifest is not None and not _list_missing(manifest, scenarios):
-        return manifest
-    # A writer may have put the scenario there since the first answer.
-    return remote_manifest(size, url, fresh=0.0)
-
-
-def _check_objects(size: Size, url: str, manifest: Manifest) -> None:
-    """Refuse a store that lacks an object of its manifest."""
-    lengths = Objects(url, store_folder(size)).sizes()
-    wrong_scenarios = []
-    for entry in manifest.files:
-        if lengths.get(entry.path) != entry.bytes:
-            wrong_scenarios.append(entry.scenario)
-    if wrong_scenarios:
-        raise DataError(
-            f"the store lacks scenarios {format_ids(wrong_scenarios)} of its manifest, "
-            f"or they have another length; {_rewriting(size, url)}",
-            where=object_address(size, url, MANIFEST_NAME),
-        )
-
-
-def _rewriting(size: Size, url: str) -> str:
-    """Return what writes a data set of a store anew."""
-    return f"lagbench generate --split {size.split} --size {size.name} --root {url}"
-
-
-def _list_lacking(
-    entries: Iterable[FileEntry],
-    size: Size,
-    root: Path,
-    trusted: Manifest | None = None,
-) -> list[FileEntry]:
-    return [entry for entry in entries if not is_in_copy(entry, size, root, trusted)]
+        lacking = [e for e in lacking if not is_in_copy(e, size, root)]
+        fetch_entries(size, root, url, lacking)
+        write_manifest(root, manifest)
 
 
 def remote_manifest(
@@ -274,22 +227,6 @@ def remote_manifest(
     return manifest
 
 
-def list_unstored(size: Size, root: Path, scenarios: Iterable[int]) -> tuple[int, ...]:
-    """Return the scenarios that a working copy's store lacks; none for a folder."""
-    url = url_of(root)
-    if url is None:
-        return ()
-    manifest = remote_manifest(size, url)
-    if manifest is None:
-        return tuple(scenarios)
-    return _list_missing(manifest, scenarios)
-
-
-def _list_missing(manifest: Manifest, scenarios: Iterable[int]) -> tuple[int, ...]:
-    """Return the scenarios without an entry in a manifest."""
-    return tuple(scenario for scenario in scenarios if manifest.entry(scenario) is None)
-
-
 def matches_registry(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
     """Return whether an entry of a manifest has the hash of datasets.yaml.
 
@@ -304,47 +241,6 @@ def matches_registry(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
         return True
     is_tolerant = manifest.identity == "tolerance"
     return is_tolerant and may_differ(entry.device, manifest.environments)
-
-
-def add_local_entries(size: Size, root: Path, manifest: Manifest) -> Manifest:
-    """Return the store's manifest with the entries that only the working copy has."""
-    folder = size.folder(root)
-    local_manifest = read_or_empty(size, root)
-    local_entries = []
-    for entry in local_manifest.files:
-        if manifest.entry(entry.scenario) is not None:
-            continue
-        is_right = matches_registry(entry, size, local_manifest)
-        if is_right and (folder / entry.path).is_file():
-            local_entries.append(entry)
-    return join_manifests(size, manifest, local_manifest, local_entries)
-
-
-def join_manifests(
-    size: Size, base: Manifest, other: Manifest, files: Collection[FileEntry]
-) -> Manifest:
-    """Return a manifest with entries, machines and statistics of another.
-
-    Args:
-        size: the data set.
-        base: the manifest.
-        other: the other one; its statistics count where both have the same train.
-        files: entries to take from the other one; none leaves the base as it is.
-    """
-    if not files:
-        return base
-    environments = list(base.environments)
-    for environment in other.environments:
-        if environment not in base.environments:
-            environments.append(environment)
-    widened = base.model_copy(update={"environments": tuple(environments)})
-    joined = merge_entries(size, widened, files)
-    has_same_train = joined.subset_sha256.get("train") == other.subset_sha256.get(
-        "train"
-    )
-    if joined.statistics or not has_same_train:
-        return joined
-    return joined.model_copy(update={"statistics": other.statistics})
 
 
 def is_in_copy(
@@ -398,10 +294,108 @@ def fetch_entries(
                 raise error
 
 
+class Publication:
+    """A data set in a store, and the working copy that it is written from.
+
+    Raises:
+        DataError: the bucket does not exist.
+        WorkFailedError: the store refuses or does not answer.
+        UsageError: nothing can be written there, or a package is not installed.
+    """
+
+    def __init__(self, size: Size, root: Path, url: str) -> None:
+        self._size = size
+        self._root = root
+        self._objects = Objects(url, store_folder(size))
+        # right entries of the store whose objects are there, by id
+        self.stored_entries = self._read_entries(self._read_manifest())
+
+    def _read_manifest(self) -> Manifest:
+        """Return the store's manifest; an empty one where none can be read."""
+        manifest = None
+        with contextlib.suppress(WrongContentError):  # it is written anew
+            manifest = remote_manifest(self._size, self._objects.root, fresh=0.0)
+        return manifest or merge_entries(self._size, None)
+
+    def _read_entries(self, manifest: Manifest) -> dict[int, FileEntry]:
+        lengths = self._objects.lengths()
+        entries = {}
+        for entry in manifest.files:
+            is_whole = lengths.get(entry.path) == entry.bytes
+            if is_whole and matches_registry(entry, self._size, manifest):
+                entries[entry.scenario] = entry
+        return entries
+
+    def has_card(self) -> bool:
+        """Return whether the store has a card of the data set."""
+        return CARD_NAME in self._objects.lengths()
+
+    def fetch(self, scenarios: Iterable[int]) -> None:
+        """Fetch the scenarios of the store that the working copy lacks."""
+        lacking = []
+        for scenario in scenarios:
+            entry = self.stored_entries.get(scenario)
+            if entry is not None and not is_in_copy(entry, self._size, self._root):
+                lacking.append(entry)
+        fetch_entries(self._size, self._root, self._objects.root, lacking)
+
+    def put_files(self, manifest: Manifest, cards: Iterable[Path] = ()) -> None:
+        """Put the files that the store lacks, the cards, and the manifest last.
+
+        The manifest keeps the entries that other writers have added.
+
+        Raises:
+            DataError: a file has another hash than its entry.
+        """
+        size = self._size
+        folder = size.folder(self._root)
+        stored_manifest = self._read_manifest()
+        stored = self._read_entries(stored_manifest)
+        for entry in manifest.files:
+            known = stored.pop(entry.scenario, None)
+            if known is not None and known.file_sha256 == entry.file_sha256:
+                continue
+            path = folder / entry.path
+            if file_sha256(path) != entry.file_sha256:
+                raise DataError(
+                    "a file of the working copy is not the one that its manifest "
+                    "names; remove it and repeat the command",
+                    where=str(path),
+                )
+            self._objects.put(entry.path, path)
+        for path in cards:
+            self._objects.put(path.relative_to(folder).as_posix(), path)
+
+        for environment in stored_manifest.environments if stored else ():
+            manifest = merge_entries(size, manifest, environment=environment)
+        if stored:
+            manifest = merge_entries(size, manifest, stored.values())
+        if manifest != stored_manifest:
+            path = write_manifest(self._root, manifest)
+            self._objects.put(MANIFEST_NAME, path)
+
+
+@contextlib.contextmanager
+def publish(size: Size, root: Path, url: str) -> Iterator[Publication]:
+    """Yield a publication, through which the caller writes a data set to a store.
+
+    The caller holds the lock of the working copy. Meanwhile nothing is fetched into it
+    unasked.
+    """
+    _copies_of_writers.append(root)
+    try:
+        yield Publication(size, root, url)
+    finally:
+        _copies_of_writers.remove(root)
+        _manifests.clear()
+
+
 # --- other root folders ---------------------------------------------------------------
 
 
-def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest:
+def gather(
+    size: Size, root: Path, source: Path, manifest: Manifest, *, dry_run: bool = False
+) -> Manifest:
     """Take over finished scenarios of another root folder; return the joint manifest.
 
     Each job of an array generates some scenarios into a root folder of its own. The
@@ -413,6 +407,7 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
         root: root folder to take them to.
         source: the other root folder.
         manifest: manifest of the data set in the root folder.
+        dry_run: whether to return the manifest only, and take no file.
 
     Raises:
         UsageError: the source has no such data set, or is the root folder.
@@ -420,116 +415,42 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
     """
     source_folder = size.folder(source)
     target_folder = size.folder(root)
-    source_manifest = _read_source_manifest(size, source)
-    _require_other_folder(size, root, source)
+    source_manifest = read_manifest(source, size.split, size.name, size.major)
+    is_same = source_folder.resolve() == target_folder.resolve()
+    if source_manifest is None or is_same:
+        raise UsageError(
+            f"nothing of {size.split} {size.name} can be gathered there; name the "
+            "--root of another call of lagbench generate",
+            where=str(source),
+        )
     taken_entries = []
     new_entries = []
-    for entry in _list_known_entries(size, source_manifest):
-        old_entry = manifest.entry(entry.scenario)
-        if not _adds_to(old_entry, entry):
+    for entry in source_manifest.files:
+        # A source of another minor version may have more scenarios.
+        if entry.scenario not in size.subsets.get(entry.subset, ()):
             continue
+        old_entry = manifest.entry(entry.scenario)
         target = target_folder / entry.path
-        if not target.exists():
-            check_scenario(source_folder / entry.path, entry.content_sha256)
+        if old_entry is not None:
+            is_same_content = old_entry.content_sha256 == entry.content_sha256
+            if is_same_content and not old_entry.twin_floor:
+                # The file there may be packed otherwise: its own entry stays.
+                limit = {"twin_floor": entry.twin_floor}
+                taken_entries.append(old_entry.model_copy(update=limit))
+        elif not target.exists():
             new_entries.append(entry)
-            _link_or_copy(source_folder / entry.path, target)
-            taken_entries.append(entry)
-        elif old_entry is not None:
-            # The file there may be packed otherwise: its own entry stays.
-            limit = {"twin_floor": entry.twin_floor}
-            taken_entries.append(old_entry.model_copy(update=limit))
         elif target.is_file() and file_sha256(target) == entry.file_sha256:
             taken_entries.append(entry)
-    record_entry_hashes(target_folder, new_entries)
+    if not dry_run:
+        for entry in new_entries:
+            check_scenario(source_folder / entry.path, entry.content_sha256)
+            with atomic_path(target_folder / entry.path) as temporary:
+                # Files are only ever replaced, so a shared one cannot change.
+                try:
+                    os.link((source_folder / entry.path).resolve(), temporary)
+                except OSError:
+                    shutil.copyfile(source_folder / entry.path, temporary)
+        record_entry_hashes(target_folder, new_entries)
     for environment in source_manifest.environments:
         manifest = merge_entries(size, manifest, environment=environment)
-    return merge_entries(size, manifest, taken_entries)
-
-
-def _list_known_entries(size: Size, manifest: Manifest) -> list[FileEntry]:
-    """Return the entries of scenarios that the size has in the same subset.
-
-    A source of another minor version may have more scenarios.
-    """
-    entries = []
-    for entry in manifest.files:
-        if entry.scenario in size.subsets.get(entry.subset, ()):
-            entries.append(entry)
-    return entries
-
-
-def _adds_to(old_entry: FileEntry | None, entry: FileEntry) -> bool:
-    """Tell whether an entry is new, or may add a predictability limit to an old one."""
-    if old_entry is None:
-        return True
-    is_same_content = old_entry.content_sha256 == entry.content_sha256
-    return is_same_content and not old_entry.twin_floor
-
-
-def _link_or_copy(source: Path, target: Path) -> None:
-    with atomic_path(target) as temporary:
-        # Files are only ever replaced, so a shared one cannot change.
-        try:
-            os.link(source.resolve(), temporary)
-        except OSError:
-            shutil.copyfile(source, temporary)
-
-
-def list_scenarios_to_gather(size: Size, root: Path, source: Path) -> tuple[int, ...]:
-    """Return the scenarios whose files :func:`gather` would take from a source.
-
-    :func:`gather` also takes predictability limits for scenarios that the root folder
-    has; these are not listed.
-
-    Raises:
-        UsageError: the source has no such data set, or is the root folder.
-    """
-    source_manifest = _read_source_manifest(size, source)
-    _require_other_folder(size, root, source)
-    target_manifest = read_or_empty(size, root)
-    source_folder = size.folder(source)
-    target_folder = size.folder(root)
-    scenarios = []
-    for entry in _list_known_entries(size, source_manifest):
-        is_new = target_manifest.entry(entry.scenario) is None
-        has_source_file = has_file(source_folder / entry.path)
-        has_target_file = (target_folder / entry.path).exists()
-        if is_new and has_source_file and not has_target_file:
-            scenarios.append(entry.scenario)
-    return tuple(scenarios)
-
-
-def _read_source_manifest(size: Size, source: Path) -> Manifest:
-    """Return the manifest of a source; refuse a source that has none."""
-    manifest = read_manifest(source, size.split, size.name, size.major)
-    if manifest is None:
-        raise _refuse_source(size, source, got="no manifest of that data set")
-    return manifest
-
-
-def _require_other_folder(size: Size, root: Path, source: Path) -> None:
-    """Refuse a source that is the root folder."""
-    if size.folder(source).resolve() == size.folder(root).resolve():
-        raise _refuse_source(size, source, got="the folder to write to")
-
-
-def _refuse_source(size: Size, source: Path, *, got: str) -> UsageError:
-    return UsageError(
-        f"nothing of {size.split} {size.name} can be gathered there: {got}; name the "
-        "--root of another call of lagbench generate",
-        where=str(source),
-    )
-
-
-@contextlib.contextmanager
-def suspend_fetching(root: Path) -> Iterator[None]:
-    """Fetch nothing into a working copy from which this process writes to the store.
-
-    Where several data sets are written, fetching begins again after the last of them.
-    """
-    _copies_of_writers.append(root)
-    try:
-        yield
-    finally:
-        _copies_of_writers.remove(root)
-        _manifests.clear()
+    return merge_entries(size, manifest, [*taken_entries, *new_entries])

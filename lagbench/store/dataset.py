@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
 from lagbench.data import registry
 from lagbench.data.box import AXES, parse_obstacle
+from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import parse_viscosity, reading_error, select_parameters
@@ -23,7 +24,6 @@ from .copy import scenario_files, update_working_copy
 if TYPE_CHECKING:
     from lagbench.data.layout import ScenarioKey
     from lagbench.data.manifest import Manifest
-    from lagbench.data.registry import Size
 
 
 CHUNK_BYTES = 4 << 20
@@ -32,6 +32,7 @@ CHUNK_BYTES = 4 << 20
 MOST_LETTERS = 200
 """Letters of a library's error in a message."""
 
+POSITION_AXES = ("frame", "particle", "space")
 PADDING = -1
 """Material of particles that a scenario does not have."""
 
@@ -112,12 +113,19 @@ def open_split(
             file = _open_scenario(path, tier.key(scenario), hint)
             scenarios.append(open_files.enter_context(file))
             parameters = select_parameters(file.attrs, where=str(path))
-            viscosities.append(_read_viscosity(parameters, tier, path))
+            stated = parse_viscosity(parameters.get("viscosity"), where=str(path))
+            viscosity = tier.viscosity(stated)
+            viscosities.append(math.nan if viscosity is None else viscosity)
             obstacle = parse_obstacle(parameters, tier.dimension, where=str(path))
             if obstacle is None:
                 obstacle = np.full(tier.dimension + 1, np.nan, np.float32)
             obstacles.append(obstacle)
-        _check_layers(scenarios, list(paths.values()), hint)
+        layer_counts = {s.sizes["layer"] for s in scenarios if "layer" in s.sizes}
+        if len(layer_counts) > 1:
+            raise DataError(
+                f"scenarios have forces in {sorted(layer_counts)} layers; {hint}",
+                where=f"{tier.folder(root_folder)}, variable 'body_force'",
+            )
         try:
             joined = _join_scenarios(scenarios, list(paths))
         except (ValueError, TypeError) as error:
@@ -142,26 +150,6 @@ def open_split(
         joined.encoding["source"] = str(first_path.absolute())
         joined.set_close(open_files.pop_all().close)
     return joined
-
-
-def _check_layers(
-    scenarios: Sequence[xr.Dataset], paths: Sequence[Path], fix: str
-) -> None:
-    """Refuse scenarios whose force has other layers than that of another scenario."""
-    expected = None
-    for scenario, path in zip(scenarios, paths, strict=True):
-        count = scenario.sizes.get("layer")
-        if count is None:
-            continue
-        if expected is None:
-            expected = count
-        if count != expected:
-            raise DataError(
-                f"scenarios have forces in different numbers of layers: got {count} "
-                f"layers, expected {expected} layers, as in the scenarios before; "
-                f"{fix}",
-                where=f"{path}, variable 'body_force'",
-            )
 
 
 def _join_scenarios(
@@ -204,15 +192,6 @@ def _join_scenarios(
     return joined
 
 
-def _read_viscosity(parameters: Mapping[str, object], tier: Size, path: Path) -> float:
-    """Return the given viscosity of a scenario [length^2/s], NaN where unknown."""
-    stated = parse_viscosity(parameters.get("viscosity"), where=str(path))
-    viscosity = tier.viscosity(stated)
-    if viscosity is None:
-        return math.nan
-    return viscosity
-
-
 def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
     """Open one file lazily and check that it is the scenario that its path says."""
     with ExitStack() as stack:
@@ -226,66 +205,30 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             frame_bytes = value_bytes * file.sizes["particle"] * file.sizes["space"]
             frames_per_chunk = max(1, CHUNK_BYTES // frame_bytes)
             scenario = file.chunk(frame=frames_per_chunk, particle=-1, space=-1)
-            attributes: dict[str, Any] = {}
-            for name in ("split", "size", "version"):
-                attributes[name] = _require_text(scenario.attrs[name])
-            attributes["scenario"] = int(scenario.attrs["scenario"])
-            _check_positions(file["position"])
-            _check_coordinates(file)
+            position = file["position"]
+            if position.dtype.kind != "f" or position.dims != POSITION_AXES:
+                text = f"position holds {position.dtype}, with axes {position.dims}"
+                raise ValueError(text)
+            for name in ("frame", "particle"):
+                numbers = np.arange(file.sizes[name])
+                if not np.array_equal(file[name].to_numpy(), numbers):
+                    text = f"{name} holds other numbers than 0 to {len(numbers) - 1}"
+                    raise ValueError(text)
+            stated = (
+                file.attrs["split"],
+                file.attrs["size"],
+                int(file.attrs["scenario"]),
+                major_of(file.attrs["version"]),
+            )
+            file["time"]  # a file of ours has it
         except Exception as error:  # HDF5 on damaged bytes raises nearly any type
             raise reading_error(path, error, fix=fix) from error
-        if not _is_of(key, attributes):
+        expected = (key.split, key.size, key.scenario, key.major)
+        if stated != expected:
             raise DataError(
-                f"a file holds another scenario: got {attributes}, expected {key}; "
+                f"a file holds another scenario: got {stated}, expected {expected}; "
                 f"{fix}",
                 where=str(path),
             )
         scenario.set_close(stack.pop_all().close)
     return scenario
-
-
-def _check_positions(position: xr.DataArray) -> None:
-    """Refuse positions that are no numbers, or have other axes than a file of ours.
-
-    Raises:
-        ValueError: they are something else.
-    """
-    if position.dtype.kind != "f" or position.dims != ("frame", "particle", "space"):
-        message = f"position holds {position.dtype}, with axes {position.dims}"
-        raise ValueError(message)
-
-
-def _check_coordinates(file: xr.Dataset) -> None:
-    """Refuse a file whose frames or particles are not numbered from 0, or without time.
-
-    Raises:
-        ValueError: it is such a file.
-    """
-    for name in ("frame", "particle"):
-        numbers = np.arange(file.sizes[name])
-        if not np.array_equal(file[name].to_numpy(), numbers):
-            message = f"{name} holds other numbers than 0 to {len(numbers) - 1}"
-            raise ValueError(message)
-    if "time" not in file.variables:
-        raise ValueError("there is no variable 'time'")
-
-
-def _require_text(attribute: object) -> str:
-    """Return an attribute that must be a text.
-
-    Raises:
-        TypeError: it is something else, as an array of numbers.
-    """
-    if not isinstance(attribute, str):
-        raise TypeError(f"{attribute!r:.80} is no text")
-    return attribute
-
-
-def _is_of(key: ScenarioKey, attributes: Mapping[str, Any]) -> bool:
-    """Tell whether attributes name a scenario; MINOR and PATCH may differ."""
-    return bool(
-        attributes["split"] == key.split
-        and attributes["size"] == key.size
-        and attributes["scenario"] == key.scenario
-        and attributes["version"].split(".")[0] == str(key.major)
-    )

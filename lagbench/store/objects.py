@@ -1,24 +1,17 @@
-"""Objects by URL: read, list and put whole ones.
-
-HTTP comes from the standard library; ``s3://``, ``file://`` and the rest are file
-systems of fsspec.
-"""
+"""Objects by URL, through fsspec: read, list and put whole ones."""
 
 from __future__ import annotations
 
-import http.client
-import os
 import shutil
+import tempfile
 import time
-import urllib.error
 import urllib.parse
-import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
-from lagbench.atomic import atomic_path, write_atomically
+from lagbench.atomic import atomic_path
 from lagbench.errors import (
     DataError,
     LagbenchError,
@@ -30,9 +23,6 @@ from lagbench.errors import (
 TIMEOUT = 30.0  # how long a store may be silent [s]
 ATTEMPTS = 3
 PAUSE = 1.0  # before the second attempt [s]; it doubles
-BLOCK = 1 << 18  # bytes read at a time
-
-Result = TypeVar("Result")
 
 HTTP = ("http://", "https://")
 S3 = ("s3://", "s3a://")
@@ -57,6 +47,9 @@ def check_address(url: str) -> None:
     Raises:
         UsageError: an unknown kind of address, no host or bucket, or a password.
     """
+    # only commands that use a store load it
+    from fsspec import available_protocols  # type: ignore[import-untyped]
+
     try:
         parts = urllib.parse.urlsplit(url)
     except ValueError as error:
@@ -66,22 +59,13 @@ def check_address(url: str) -> None:
             "an address holds no user and no password; let the environment give them, "
             "as by AWS_PROFILE"
         )
-    if parts.scheme not in _protocols():
+    place = parts.path if url.startswith(LOCAL) else parts.netloc
+    if parts.scheme not in available_protocols() or not place:
         raise UsageError(
-            "no such kind of address; name http://host/path, s3://bucket/prefix, or "
+            "no address of a store; name http://host/path, s3://bucket/prefix, or "
             "file:///path for a folder",
             where=url,
         )
-    is_local = url.startswith(LOCAL)
-    if not (parts.path if is_local else parts.netloc):
-        raise UsageError("the address names no place behind ://", where=url)
-
-
-def _protocols() -> list[str]:
-    """Return the kinds of addresses; only commands that use a store load fsspec."""
-    from fsspec import available_protocols  # type: ignore[import-untyped]
-
-    return list(available_protocols())
 
 
 def read_object(url: str, *, limit: int) -> bytes:
@@ -92,15 +76,10 @@ def read_object(url: str, *, limit: int) -> bytes:
         StoreUnreachableError: the store does not answer.
         DataError: it is longer than the limit [bytes].
     """
-
-    def attempt() -> bytes:
-        with _opened(url) as stream:
-            return stream.read(limit + 1)
-
-    content = _repeated(attempt, url)
-    if len(content) > limit:
-        raise DataError(f"an object is longer than {limit} bytes", where=url)
-    return content
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "object"
+        download_object(url, path, limit=limit, report=lambda _: None)
+        return path.read_bytes()
 
 
 def download_object(
@@ -115,81 +94,46 @@ def download_object(
         report: receives how many more bytes have arrived; negative where an attempt
             failed.
     """
+    check_address(url)
+    from fsspec.callbacks import Callback  # type: ignore[import-untyped]
 
-    def attempt() -> None:
-        count = 0
-        try:
-            with _opened(url) as stream, path.open("wb") as file:
-                while block := stream.read(BLOCK):
-                    count += len(block)
-                    report(len(block))
-                    if count > limit:
-                        raise DataError(
-                            f"an object is longer than {limit} bytes", where=url
-                        )
-                    file.write(block)
-        except BaseException:
-            report(-count)
-            raise
+    class Counter(Callback):  # type: ignore[misc]
+        def relative_update(self, inc: int = 1) -> None:
+            super().relative_update(inc)
+            report(inc)
+            if self.value > limit:
+                raise _length_error(url, limit)
 
-    _repeated(attempt, url)
-
-
-def _repeated(attempt: Callable[[], Result], url: str) -> Result:
-    """Return what an attempt returns; a store that does not answer is asked again."""
-    for number in range(ATTEMPTS):
+    for attempt in range(ATTEMPTS):
+        counter = Counter()
         try:
             with store_errors(url):
-                return attempt()
-        except StoreUnreachableError:
-            if number + 1 == ATTEMPTS:
+                system, name = _file_system(url)
+                system.get_file(name, str(path), callback=counter)
+            break
+        except BaseException as error:
+            report(-counter.value)
+            if attempt + 1 == ATTEMPTS or not isinstance(error, StoreUnreachableError):
                 raise
-            time.sleep(PAUSE * 2**number)
-    raise AssertionError
+            time.sleep(PAUSE * 2**attempt)
+    length = path.stat().st_size
+    report(length - counter.value)
+    if length > limit:
+        raise _length_error(url, limit)
 
 
-class _Readable(Protocol):
-    def read(self, size: int, /) -> bytes:
-        """Return at most so many bytes, none at the end."""
-
-
-@contextmanager
-def _opened(url: str) -> Iterator[_Readable]:
-    """Open an object for reading."""
-    check_address(url)
-    if url.startswith(HTTP):
-        address = urllib.parse.quote(url, safe=":/?&=%+,;~@!$'()*[]")
-        request = urllib.request.Request(address, headers={"User-Agent": "lagbench"})
-        with urllib.request.urlopen(request, timeout=TIMEOUT) as response:
-            length = response.headers.get("Content-Length")
-            yield _WholeStream(response, length)
-        return
-    system, path = _file_system(url)
-    with system.open(path, "rb") as stream:
-        yield stream
-
-
-class _WholeStream:
-    """A response that raises where it ends before the announced length."""
-
-    def __init__(self, response: _Readable, length: str | None) -> None:
-        self._response = response
-        self._missing = int(length) if length else None
-
-    def read(self, size: int, /) -> bytes:
-        """Return at most so many bytes, none at the end."""
-        block = self._response.read(size)
-        if self._missing is not None:
-            self._missing -= len(block)
-            if not block and self._missing > 0:
-                raise http.client.IncompleteRead(block, self._missing)
-        return block
+def _length_error(url: str, limit: int) -> DataError:
+    return DataError(f"an object is longer than {limit} bytes", where=url)
 
 
 class Objects:
-    """The folder of one data set version in a store of fsspec.
+    """The folder of one data set version in a store that can be written.
 
     Names of objects are relative to the folder.
+
+    Args:
+        root: address of the store.
+        folder: ``<split>/<size>/v<MAJOR>`` in it.
 
     Raises:
         UsageError: the root is no such store.
@@ -202,11 +146,12 @@ class Objects:
                 "nothing can be written over HTTP; name another --root", where=root
             )
         self.root = root
-        self.url = f"{root}/{folder}"  # the store; ``<split>/<size>/v<MAJOR>`` in it
+        self.url = f"{root}/{folder}"
         with store_errors(self.url):
-            self._system, self._path = _file_system(self.url)
+            self._system, path = _file_system(self.url)
+        self._prefix = path.rstrip("/") + "/"
 
-    def sizes(self) -> dict[str, int]:
+    def lengths(self) -> dict[str, int]:
         """Return the length of every object by name [bytes].
 
         Raises:
@@ -214,42 +159,21 @@ class Objects:
         """
         check_bucket(self.root)
         with store_errors(self.url):
-            objects = self._system.find(self._path, detail=True)
-        prefix = self._path.rstrip("/") + "/"
-        lengths = {}
-        for path, details in objects.items():
-            if path.startswith(prefix):
-                lengths[path.removeprefix(prefix)] = int(details["size"])
-        return lengths
-
-    def read(self, name: str) -> bytes | None:
-        """Return a small object; None where it is not there."""
-        with store_errors(self.url):
-            try:
-                return bytes(self._system.cat_file(self._path_of(name)))
-            except FileNotFoundError:
-                return None
-
-    def write(self, name: str, data: bytes) -> None:
-        """Put a small object, whole or not at all."""
-        with store_errors(self.url):
-            if self.url.startswith(LOCAL):
-                write_atomically(Path(self._path_of(name)), data)
-            else:
-                self._system.pipe_file(self._path_of(name), data)
+            objects = self._system.find(self._prefix, detail=True)
+        return {
+            path.removeprefix(self._prefix): int(details["size"])
+            for path, details in objects.items()
+        }
 
     def put(self, name: str, source: Path) -> None:
         """Put a file as an object, whole or not at all."""
         with store_errors(self.url):
             if self.url.startswith(LOCAL):
                 # On a file system a put is not atomic by itself.
-                with atomic_path(Path(self._path_of(name))) as beside:
+                with atomic_path(Path(self._prefix + name)) as beside:
                     shutil.copyfile(source, beside)
             else:
-                self._system.put_file(str(source), self._path_of(name))
-
-    def _path_of(self, name: str) -> str:
-        return f"{self._path.rstrip('/')}/{name}"
+                self._system.put_file(str(source), self._prefix + name)
 
 
 def check_bucket(url: str) -> None:
@@ -257,14 +181,9 @@ def check_bucket(url: str) -> None:
     if not url.startswith(S3):
         return
     with store_errors(url):
-        system, _ = _file_system(url)
-        bucket = url.split("//", 1)[1].split("/")[0]
-        if not system.exists(bucket):
+        system, path = _file_system(url)
+        if not system.exists(path.split("/")[0]):
             raise DataError("there is no such bucket; create it", where=url)
-
-
-_systems: dict[tuple[object, ...], Any] = {}
-"""File systems of fsspec, by kind of address and settings."""
 
 
 def _file_system(url: str) -> tuple[Any, str]:
@@ -272,6 +191,8 @@ def _file_system(url: str) -> tuple[Any, str]:
 
     No listing is cached: changes by other machines must be seen at once.
     """
+    import fsspec
+
     options: dict[str, Any] = {}
     if url.startswith(S3):
         require("s3fs", extra="s3")
@@ -280,18 +201,12 @@ def _file_system(url: str) -> tuple[Any, str]:
             "read_timeout": TIMEOUT,
             "retries": {"total_max_attempts": 2},
         }
-    import fsspec
-
-    # Another endpoint or other credentials are another system within one process.
-    settings = [item for item in os.environ.items() if item[0].startswith("AWS_")]
-    key = (url.partition("/")[0], urllib.parse.urlsplit(url).netloc, *sorted(settings))
-    if key not in _systems:
-        system, _ = fsspec.core.url_to_fs(
-            url, use_listings_cache=False, skip_instance_cache=True, **options
-        )
-        _systems[key] = system
-    system = _systems[key]
-    return system, system._strip_protocol(url)
+    elif url.startswith(HTTP):
+        aiohttp = require("aiohttp", extra="s3")
+        timeout = aiohttp.ClientTimeout(sock_connect=TIMEOUT, sock_read=TIMEOUT)
+        options["client_kwargs"] = {"timeout": timeout}
+    system, path = fsspec.core.url_to_fs(url, use_listings_cache=False, **options)
+    return system, path
 
 
 @contextmanager
@@ -306,16 +221,15 @@ def store_errors(url: str) -> Iterator[None]:
         yield
     except LagbenchError:
         raise
+    except FileNotFoundError as error:
+        raise NotInStoreError(
+            "the store does not have the object", where=url
+        ) from error
+    except ImportError as error:
+        raise UsageError(
+            f"this kind of address needs another package: {error}", where=url
+        ) from error
     except Exception as error:  # file systems raise what their libraries raise
-        code = getattr(error, "code", None)
-        if isinstance(error, FileNotFoundError) or code in (404, 410):
-            raise NotInStoreError(
-                "the store does not have the object", where=url
-            ) from error
-        if isinstance(error, ImportError):
-            raise UsageError(
-                f"this kind of address needs another package: {error}", where=url
-            ) from error
         raise StoreUnreachableError(
             f"the store does not answer or refuses ({type(error).__name__}: "
             f"{str(error)[:200]}); repeat the command later, or name another store",

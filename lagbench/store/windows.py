@@ -8,7 +8,6 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from html import escape
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,6 @@ from lagbench.data.layout import has_file, major_of
 from lagbench.data.local import check_contents, locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import (
-    damage_error,
     parse_viscosity,
     reading_error,
     select_parameters,
@@ -42,26 +40,20 @@ OPEN_FILES = 128
 """Files that a store keeps open, about 0.6 MB each; our splits train on up to 63."""
 
 
-class _OpenScenario(NamedTuple):
-    """An open file, with the arrays that all its windows share."""
+class OpenScenario(NamedTuple):
+    """An open file, with what all its windows share."""
 
     file: h5py.File
     position: h5py.Dataset
+    # 0 liquid, 1 jelly, 2 snow, 3 rope, shape [particle]; 0 in files without it
     material: NDArray[np.int8]
+    # velocity of the walls [length/s], shape [frame, wall, axis]; None without
     wall_velocity: Floats | None
+    # acceleration of the fluid [length/s^2] in layers of equal height along y, lowest
+    # first, shape [frame, layer, axis]; entry f acts from frame f-1 to frame f
     body_force: Floats | None
-    viscosity: float | None
-    obstacle: Floats | None
-
-
-class _Identity(NamedTuple):
-    """Names and length of a scenario."""
-
-    split: str
-    size: str
-    major: int
-    scenario: int
-    frames: int
+    viscosity: float | None  # kinematic viscosity that is given [length^2/s]
+    obstacle: Floats | None  # centre and radius [length], shape [axis + 1]
 
 
 class FrameStore:
@@ -87,7 +79,7 @@ class FrameStore:
     def _reset(self) -> None:
         self._process = os.getpid()
         # least recently used first
-        self._open_scenarios: OrderedDict[int, _OpenScenario] = OrderedDict()
+        self._open_scenarios: OrderedDict[int, OpenScenario] = OrderedDict()
         self._cached_frames: OrderedDict[tuple[int, int], Floats] = OrderedDict()
         self.cached_bytes = 0
 
@@ -108,89 +100,34 @@ class FrameStore:
 
         The arrays are those of the cache: copy them, never write to them.
         """
-        self._reset_after_fork()
-        values = {}
-        missing = []
-        for frame in range(start, stop):
-            cached = self._cached_frames.get((scenario, frame))
-            if cached is None:
-                missing.append(frame)
-            else:
-                values[frame] = cached
-        for first, last in _consecutive_runs(missing):
-            values.update(self._read(scenario, first, last))
-
+        opened = self.open(scenario)
+        keys = [(scenario, frame) for frame in range(start, stop)]
+        missing = [key[1] for key in keys if key not in self._cached_frames]
+        if missing:
+            with self._damage_errors(scenario):
+                self._read(opened, scenario, missing[0], missing[-1] + 1)
         frames = []
-        for frame in range(start, stop):
-            if frame in values:
-                frames.append(values[frame])
-        for frame, positions in sorted(values.items()):
-            self._cache(scenario, frame, positions)
+        for key in keys:
+            if key in self._cached_frames:
+                self._cached_frames.move_to_end(key)
+                frames.append(self._cached_frames[key])
         while self.cached_bytes > self.cache_bytes:
             _, oldest = self._cached_frames.popitem(last=False)
             self.cached_bytes -= oldest.nbytes
         return frames
 
-    def _cache(self, scenario: int, frame: int, positions: Floats) -> None:
-        """Keep a frame as the last used one."""
-        key = (scenario, frame)
-        if key not in self._cached_frames:
-            self._cached_frames[key] = positions
-            self.cached_bytes += positions.nbytes
-        self._cached_frames.move_to_end(key)
+    def _read(self, opened: OpenScenario, scenario: int, start: int, stop: int) -> None:
+        """Put consecutive frames into the cache."""
+        for frame, positions in enumerate(opened.position[start:stop], start=start):
+            if (scenario, frame) not in self._cached_frames:
+                # A copy, so that its memory is free when it leaves the cache.
+                self._cached_frames[scenario, frame] = positions.copy()
+                self.cached_bytes += positions.nbytes
 
-    def material_and_walls(
-        self, scenario: int
-    ) -> tuple[NDArray[np.int8], Floats | None]:
-        """Return the material of each particle, and the walls' velocity in each frame.
-
-        Material has the shape [particle] and is 0, liquid, in files without it. Wall
-        velocity [length/s] has the shape [frame, wall, axis]; it is None where the
-        files hold none.
-        """
-        self._reset_after_fork()
-        opened = self._open(scenario)
-        return opened.material, opened.wall_velocity
-
-    def body_force(self, scenario: int) -> Floats | None:
-        """Return the force that drives the flow [length/s^2], if one does.
-
-        It is the acceleration of the fluid in layers of equal height along y, lowest
-        first, shape [frame, layer, axis]. Entry f acts from frame f-1 to frame f.
-        """
-        self._reset_after_fork()
-        return self._open(scenario).body_force
-
-    def viscosity(self, scenario: int) -> float | None:
-        """Return the kinematic viscosity that is given [length^2/s], if one is."""
-        self._reset_after_fork()
-        return self._open(scenario).viscosity
-
-    def obstacle(self, scenario: int) -> Floats | None:
-        """Return centre and radius of the fixed obstacle [length], if there is one.
-
-        The shape is [axis + 1].
-        """
-        self._reset_after_fork()
-        return self._open(scenario).obstacle
-
-    def _reset_after_fork(self) -> None:
-        """Reopen files after a fork: HDF5 handles do not survive one."""
-        if os.getpid() != self._process:
-            self._reset()
-
-    def _read(
-        self, scenario: int, first: int, last: int
-    ) -> Iterator[tuple[int, Floats]]:
-        """Yield numbers and positions of the frames from the first to the last."""
-        with self._damage_errors(scenario):
-            values = self._open(scenario).position[first : last + 1]
-        for frame, positions in enumerate(values, start=first):
-            # A copy, so that each frame's memory is free when it leaves the cache.
-            yield frame, positions.copy()
-
-    def _open(self, scenario: int) -> _OpenScenario:
+    def open(self, scenario: int) -> OpenScenario:
         """Return an open file; of too many the least recently used is closed."""
+        if os.getpid() != self._process:
+            self._reset()  # HDF5 handles do not survive a fork
         if scenario not in self._open_scenarios:
             with self._damage_errors(scenario):
                 self._open_scenarios[scenario] = self._open_checked(scenario)
@@ -200,7 +137,7 @@ class FrameStore:
         self._open_scenarios.move_to_end(scenario)
         return self._open_scenarios[scenario]
 
-    def _open_checked(self, scenario: int) -> _OpenScenario:
+    def _open_checked(self, scenario: int) -> OpenScenario:
         """Open a file; refuse one of another scenario, version or content."""
         path = self._paths[scenario]
         if not has_file(path):
@@ -213,80 +150,62 @@ class FrameStore:
         variables = list_variables(file)
         position = variables["position"]
         try:
-            self._check_positions(position, scenario)
-            self._check_identity(file, scenario, frames=len(position))
+            self._check_file(file, position, scenario)
         except DataError:
             file.close()
             raise
-        material = np.zeros(position.shape[1], np.int8)
-        if "material" in variables:
-            material = variables["material"][...]
-        wall_velocity = None
-        if "wall_velocity" in variables:
-            wall_velocity = variables["wall_velocity"][...]
-        body_force = None
-        if "body_force" in variables:
-            body_force = variables["body_force"][...]
+        arrays: dict[str, Any] = {}
+        for name in ("material", "wall_velocity", "body_force"):
+            arrays[name] = variables[name][...] if name in variables else None
+        if arrays["material"] is None:
+            arrays["material"] = np.zeros(position.shape[1], np.int8)
         parameters = select_parameters(file.attrs, where=str(path))
         stated = parse_viscosity(parameters.get("viscosity"), where=str(path))
-        viscosity = self._size.viscosity(stated)
-        obstacle = parse_obstacle(parameters, self._size.dimension, where=str(path))
-        return _OpenScenario(
-            file, position, material, wall_velocity, body_force, viscosity, obstacle
+        return OpenScenario(
+            file,
+            position,
+            **arrays,
+            viscosity=self._size.viscosity(stated),
+            obstacle=parse_obstacle(parameters, self._size.dimension, where=str(path)),
         )
 
-    def _check_positions(self, position: h5py.Dataset, scenario: int) -> None:
-        """Refuse positions that are not float32, are empty, or have other axes than
-        the box.
-        """
-        has_axes = position.ndim == 3 and position.shape[2] == self._size.dimension
-        if position.dtype == np.float32 and has_axes and position.size:
-            return
-        raise damage_error(
-            self._paths[scenario],
-            f"{position.dtype}, shape {position.shape}",
-            "position",
-            fix=self._repair_hint(scenario),
-        )
-
-    def _check_identity(self, file: h5py.File, scenario: int, *, frames: int) -> None:
-        """Refuse a file of another scenario, version or content."""
+    def _check_file(
+        self, file: h5py.File, position: h5py.Dataset, scenario: int
+    ) -> None:
+        """Refuse a file of another scenario, version, content or kind."""
         size = self._size
-        stated = _Identity(
-            split=_read_text(file, "split"),
-            size=_read_text(file, "size"),
-            major=major_of(_read_text(file, "version")),
-            scenario=self._read_id(file, scenario),
-            frames=frames,
+        where = str(self._paths[scenario])
+        has_axes = position.ndim == 3 and position.shape[2] == size.dimension
+        if position.dtype != np.float32 or not has_axes or not position.size:
+            raise DataError(
+                f"the file is damaged: position is {position.dtype}, shape "
+                f"{position.shape}; {self._repair_hint(scenario)}",
+                where=where,
+            )
+        texts = {}
+        for name in ("split", "size", "version", "content_sha256"):
+            value = file.attrs[name]
+            # netCDF4 stores ASCII text as bytes
+            texts[name] = value.decode() if isinstance(value, bytes) else str(value)
+        stated = (
+            texts["split"],
+            texts["size"],
+            major_of(texts["version"]),
+            np.asarray(file.attrs["scenario"]).tolist(),
+            len(position),
         )
-        expected = _Identity(
-            split=size.split,
-            size=size.name,
-            major=size.major,
-            scenario=scenario,
-            frames=size.frame_count(scenario),
-        )
-        content_hash = _read_text(file, "content_sha256")
+        frames = size.frame_count(scenario)
+        expected = (size.split, size.name, size.major, scenario, frames)
+        content_hash = texts["content_sha256"]
         recorded_hash = size.registered_hash(scenario)
         if stated != expected or not content_hash.startswith(recorded_hash):
             raise DataError(
-                f"a scenario file is not that of the registry: got {tuple(stated)}, "
-                f"content hash {content_hash[:16]}, expected (split, size, version, "
-                f"id, frames) = {tuple(expected)}, content hash "
-                f"{recorded_hash or 'any'}; {self._repair_hint(scenario)}",
-                where=str(self._paths[scenario]),
+                f"a scenario file is not that of the registry: got {stated}, content "
+                f"hash {content_hash[:16]}, expected (split, size, version, id, "
+                f"frames) = {expected}, content hash {recorded_hash or 'any'}; "
+                f"{self._repair_hint(scenario)}",
+                where=where,
             )
-
-    def _read_id(self, file: h5py.File, scenario: int) -> int:
-        """Return the id that a file states; refuse what is no whole number."""
-        value = np.asarray(file.attrs["scenario"])
-        if value.size == 1 and value.dtype.kind in "iu":
-            return int(value.item())
-        raise damage_error(
-            self._paths[scenario],
-            f"attribute scenario = {ascii(value.tolist())[:80]}",
-            fix=self._repair_hint(scenario),
-        )
 
     @contextmanager
     def _damage_errors(self, scenario: int) -> Iterator[None]:
@@ -304,25 +223,6 @@ class FrameStore:
         root = self._paths[scenario].parents[4]
         subset = self._size.subset_of(scenario)
         return suggest_repair(self._size, f"--subset {subset}", root=root)
-
-
-def _consecutive_runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Return first and last number of each run of consecutive ascending numbers."""
-    runs: list[tuple[int, int]] = []
-    for number in numbers:
-        if runs and runs[-1][1] == number - 1:
-            runs[-1] = (runs[-1][0], number)
-        else:
-            runs.append((number, number))
-    return runs
-
-
-def _read_text(file: h5py.File, name: str) -> str:
-    """Return an attribute as text; netCDF4 stores ASCII text as bytes."""
-    value = file.attrs[name]
-    if isinstance(value, bytes):
-        return value.decode()
-    return str(value)
 
 
 class Window(NamedTuple):
@@ -354,21 +254,6 @@ class Window(NamedTuple):
         return summarise_arrays("Window", self._asdict())
 
 
-def _check_bytes(value: float, name: str) -> None:
-    """Refuse a size of memory below 0; infinity is one.
-
-    Raises:
-        UsageError: it is below 0 or no number.
-    """
-    if value >= 0:
-        return
-    raise UsageError(
-        f"{name} is no number from 0: {repr(value)[:80]}; give bytes, as in "
-        f"{name}=1e9, or leave {name} out",
-        where=name,
-    )
-
-
 class WindowReader:
     """All windows of ``history + future`` consecutive frames, by number.
 
@@ -394,7 +279,6 @@ class WindowReader:
         origin: bool = False,
         verify: bool = False,
     ) -> None:
-        _check_bytes(cache_bytes, "cache_bytes")
         tier, root_folder, _ = locate(split, size, root=root, registry=registry)
         if isinstance(subset, str):
             subset = (subset,)
@@ -425,17 +309,11 @@ class WindowReader:
                 f"{tier.task.input_frames}",
                 where=where,
             )
-        if not frame_counts:
-            raise UsageError(
-                "no windows can be read like that: 0 scenarios; name a subset, as in "
-                "subset='train'",
-                where=where,
-            )
         if not len(self):
             raise UsageError(
-                f"no scenario is as long as a window: got {self.length}: history "
-                f"{self.history}, future {future}, expected at most "
-                f"{max(frame_counts)} frames; ask for fewer frames",
+                f"no scenario is as long as a window of {self.history} + {future} "
+                f"frames: the longest has {max(frame_counts, default=0)}; ask for "
+                "fewer frames",
                 where=where,
             )
         if verify:
@@ -448,28 +326,12 @@ class WindowReader:
 
     def __repr__(self) -> str:
         """Return data set, subsets, number and length of the windows."""
-        facts = ", ".join(f"{name} {value}" for name, value in self._facts.items())
-        return f"<{type(self).__name__}: {facts}>"
-
-    def _repr_html_(self) -> str:
-        """Return the same as a table, for notebooks; escaped."""
-        rows = []
-        for name, value in self._facts.items():
-            rows.append(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>")
-        caption = escape(type(self).__name__)
-        return f"<table><caption>{caption}</caption>{''.join(rows)}</table>"
-
-    @property
-    def _facts(self) -> dict[str, str]:
-        """What the windows are, by name."""
-        return {
-            "data set": f"{self.size.split} {self.size.name}",
-            "subsets": "+".join(self.subsets),
-            "scenarios": str(len(self.scenarios)),
-            "windows": str(len(self)),
-            "frames": f"{self.history} given + {self.future} to predict",
-            "particles": str(self.size.particles),
-        }
+        return (
+            f"<{type(self).__name__}: data set {self.size.split} {self.size.name}, "
+            f"subsets {'+'.join(self.subsets)}, scenarios {len(self.scenarios)}, "
+            f"windows {len(self)}, frames {self.history} given + {self.future} to "
+            f"predict, particles {self.size.particles}>"
+        )
 
     @property
     def gravity(self) -> float:
@@ -507,47 +369,27 @@ class WindowReader:
         scenario, frame = self.place(index)
         end = frame + self.length
         frames = self.store.frames(scenario, frame, end)
-        material, walls = self.store.material_and_walls(scenario)
+        opened = self.store.open(scenario)
+        walls = opened.wall_velocity
         if walls is not None:
             walls = walls[frame:end]
-        window = copy_window(frames, material, walls, scenario, frame)
-        viscosity = self.store.viscosity(scenario)
-        window = window._replace(viscosity=viscosity)
-        force = self.store.body_force(scenario)
-        if force is not None:
-            shown_force = force[frame:end].copy()
-            window = window._replace(body_force=shown_force)
-        obstacle = self.store.obstacle(scenario)
-        if obstacle is not None:
-            window = window._replace(obstacle=obstacle.copy())
-        if not self.origin:
-            return window
-        (first_frame,) = self.store.frames(scenario, 0, 1)
-        return window._replace(origin=first_frame.copy())
+        force = opened.body_force
+        obstacle = opened.obstacle
+        origin = None
+        if self.origin:
+            (first_frame,) = self.store.frames(scenario, 0, 1)
+            origin = first_frame.copy()
+        window = copy_window(frames, opened.material, walls, scenario, frame)
+        return window._replace(
+            viscosity=opened.viscosity,
+            body_force=None if force is None else force[frame:end].copy(),
+            obstacle=None if obstacle is None else obstacle.copy(),
+            origin=origin,
+        )
 
 
 class Windows(WindowReader):
-    """Windows as NumPy arrays: ``len(data)``, ``data[i]``, ``for window in data``."""
-
-    def __getitem__(self, index: int) -> Window:
-        """Return a window."""
-        return self.read(index)
-
-
-def windows(
-    split: str | Path,
-    size: str | None = None,
-    *,
-    subset: str | Sequence[str] = "train",
-    root: str | Path | None = None,
-    history: int | None = None,
-    future: int = 1,
-    registry: Registry | None = None,
-    cache_bytes: float = CACHE_BYTES,
-    origin: bool = False,
-    verify: bool = False,
-) -> Windows:
-    """Open all windows of consecutive frames as NumPy arrays, without PyTorch.
+    """All windows of consecutive frames as NumPy arrays, without PyTorch.
 
     ``data[i]`` has ``position`` [length], float32, shape [particle, frame, axis];
     ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
@@ -580,18 +422,13 @@ def windows(
         DataError: scenarios are missing; the message has the command that makes them.
             Or a file is damaged, and `verify` is true.
     """
-    return Windows(
-        split,
-        subset=subset,
-        size=size,
-        root=root,
-        history=history,
-        future=future,
-        registry=registry,
-        cache_bytes=cache_bytes,
-        origin=origin,
-        verify=verify,
-    )
+
+    def __getitem__(self, index: int) -> Window:
+        """Return a window."""
+        return self.read(index)
+
+
+windows = Windows
 
 
 def copy_window(

@@ -1,7 +1,6 @@
 """Run jobs here, in worker processes or on a Dask cluster, and count their work.
 
-Results come in the order of the jobs. A job of a lost worker is run again. Neither that
-nor the place of the work changes a result.
+Results come in the order of the jobs; the place of the work does not change them.
 """
 
 from __future__ import annotations
@@ -13,24 +12,15 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from . import pool
-from .cluster import Cluster
-from .pool import Pool, Report, WorkItem
+from .executor import Report, WorkItem, run_items
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MIN_BYTES_FOR_WORKERS = 1 << 30
 """Bytes of files below which starting processes costs more than it gains."""
-
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-"""Environment of workers.
-
-Threads of NumPy and HDF5 would only take the cores from other workers. Dask sets it for
-its own workers.
-"""
 
 
 # --- jobs -----------------------------------------------------------------------------
@@ -53,12 +43,16 @@ def run_all(
         scheduler: address of a Dask scheduler, in place of workers.
         report: receives the units of work that the jobs have done.
     """
-    if scheduler is not None:
-        return _run_with(Cluster(scheduler), function, jobs, report)
-    if workers > 1 and len(jobs) > 1 and pool.AVAILABLE:
-        worker_pool = Pool(min(workers, len(jobs)), ONE_THREAD)
-        return _run_with(worker_pool, function, jobs, report)
-    return [function(job, report) for job in jobs.values()]
+    if scheduler is None and (workers == 1 or len(jobs) == 1):
+        return [function(job, report) for job in jobs.values()]
+    items = []
+    for name, job in jobs.items():
+        items.append(WorkItem(name=name, function=function, argument=job))
+    results: dict[str, Any] = {}
+    for finished in run_items(items, workers=workers, scheduler=scheduler):
+        results[finished.item.name] = finished.value
+        report(finished.units)
+    return [results[name] for name in jobs]
 
 
 def read_many(
@@ -75,26 +69,6 @@ def read_many(
     if total_bytes < MIN_BYTES_FOR_WORKERS:
         return run_all(function, jobs, report=report)
     return run_all(function, jobs, workers=workers, scheduler=scheduler, report=report)
-
-
-def _run_with(
-    workers: Pool | Cluster,
-    function: Callable[[Job, Report], Result],
-    jobs: Mapping[str, Job],
-    report: Report,
-) -> list[Result]:
-    results: dict[str, Result] = {}
-    with workers as team:
-        for name, job in jobs.items():
-            team.submit(WorkItem(name=name, function=function, arguments=(job,)))
-        for event in team.events():
-            if event.kind == "done":
-                results[event.item.name] = event.value
-            elif event.kind == "progress":
-                report(event.value)
-            else:  # the work of a lost worker was in vain
-                report(-event.value)
-    return [results[name] for name in jobs]
 
 
 # --- progress -------------------------------------------------------------------------

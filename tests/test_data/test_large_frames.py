@@ -15,7 +15,7 @@ from scenario_factory import make_key, write_scenario
 
 from lagbench.data import writer as files
 from lagbench.data.scenario import check_scenario, read_scenario
-from lagbench.work.pool import Report
+from lagbench.work.executor import Report
 from lagbench.work.run import read_many
 
 

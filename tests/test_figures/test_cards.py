@@ -17,8 +17,6 @@ from pathlib import Path
 import pytest
 import yaml
 from conftest import PAINT_PICTURES
-from hypothesis import given
-from hypothesis import strategies as st
 from rotating_disc import write_swirl
 
 from lagbench.atomic import ROOT_OPTION
@@ -32,7 +30,7 @@ from lagbench.data.manifest import (
 )
 from lagbench.data.registry import Size
 from lagbench.errors import WorkFailedError
-from lagbench.figures.tables import escape, markdown
+from lagbench.figures.tables import escape
 from lagbench.make import cards
 from lagbench.make.croissant import croissant_json
 from lagbench.make.generate import GenerationResult
@@ -423,38 +421,3 @@ def test_hostile_text_of_a_registry_stays_text() -> None:
     assert "\n# head" not in body
     document = json.loads(croissant_json(size, hostile, manifest))
     assert document["citeAs"] == hostile.citation
-
-
-PRINTABLE = st.characters(codec="utf-8", exclude_categories=["Cc", "Zl", "Zp"])
-
-
-@pytest.mark.slow
-@given(st.text(PRINTABLE))
-def test_escaping_only_adds_backslashes(text: str) -> None:
-    """Taking the backslashes away gives the text on one line; no special character
-    stands bare.
-    """
-    escaped = escape(text)
-    on_one_line = " ".join(text.split())
-    without_backslashes = re.sub(r"\\([\\`*_\[\]<>|#&~$])", r"\1", escaped)
-    assert without_backslashes == on_one_line
-    without_pairs = re.sub(r"\\.", "", escaped)
-    assert not re.search(r"[`*_\[\]<>|#&~$]", without_pairs)
-
-
-def test_tables_set_numbers_flush_right() -> None:
-    """Whole columns of numbers are flush right, with thousands apart; code stays
-    code.
-    """
-    columns = ("n", "`code`|")
-    rows = [
-        (1234, "`a_b`"),
-        (5, "c_d"),
-    ]
-    table = markdown(columns, rows)
-    assert table.splitlines() == [
-        r"| n | \`code\`\| |",
-        "| ---: | --- |",
-        "| 1,234 | `a_b` |",
-        r"| 5 | c\_d |",
-    ]

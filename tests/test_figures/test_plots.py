@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from drawn_scenarios import record
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.testing import assert_allclose
@@ -15,7 +16,7 @@ from PIL import Image
 from rotating_disc import OMEGA, write_swirl
 
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.figures.canvas import ENDINGS, encode, figure, save
+from lagbench.figures.canvas import ENDINGS, figure, save
 from lagbench.figures.colours import MATERIAL_COLOURS, parse_rgb
 from lagbench.figures.panels import (
     Panel,
@@ -27,7 +28,6 @@ from lagbench.figures.panels import (
 from lagbench.figures.pictures import plot
 from lagbench.figures.plot import contact_sheet, describe, draw_frame
 from lagbench.figures.recording import open_recording
-from lagbench.store.dataset import open_split
 
 Pixels = NDArray[np.uint8]
 
@@ -49,31 +49,6 @@ def has_colour(pixels: Pixels, colour: str) -> NDArray[np.bool_]:
     colour_of_pixel = parse_rgb(colour)
     is_equal: NDArray[np.bool_] = (pixels == colour_of_pixel).all(axis=-1)
     return is_equal
-
-
-CUTS = {
-    "late": slice(1, None),
-    "strided": slice(None, None, 2),
-    "short": slice(0, 3),
-    "one": 2,
-}
-
-
-@pytest.mark.parametrize("cut", CUTS)
-def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
-    """Frames may be missing before, between or behind those that are left."""
-    for scenario in (0, 1):
-        write_swirl(
-            tmp_path,
-            "fluid",
-            scenario,
-            walls=None,
-            parameters={"family": "disc"},
-        )
-    with open_split("fluid", subset="train", size="tiny", root=tmp_path) as data:
-        part = data.isel(scenario=0, frame=CUTS[cut])
-        with pytest.raises(UsageError):
-            draw_frame(part, 0)
 
 
 @pytest.mark.parametrize("frame", [0, 3])
@@ -151,9 +126,8 @@ def build_uniform_flow(velocity: tuple[float, float], *, lattice: int) -> xr.Dat
 def test_streamlines_of_a_periodic_box_reach_its_edges() -> None:
     """The field goes on beyond an edge of the box, so no line ends there."""
     data = build_uniform_flow((0.01, 0.004), lattice=40)
-    with open_recording(data) as recording:
-        scene = recording.scene(1)
-        spacing = scene.fields.grid.spacing
+    scene = record(data).scene(1)
+    spacing = scene.fields.grid.spacing
     with figure(3, 3) as drawn:
         axes = drawn.add_axes((0, 0, 1, 1))
         draw(axes, Panel.STREAMLINES, scene, limit=1.0)
@@ -218,7 +192,7 @@ def test_frames_at_rest_have_no_say_in_a_common_colour_scale() -> None:
 
 
 def test_a_picture_has_the_same_bytes_twice(swirl: Path, tmp_path: Path) -> None:
-    """As a picture, a page and a drawing; a data set draws what its file draws."""
+    """As a picture, a page and a drawing."""
     for ending in ENDINGS:
         paths = []
         for name in ("first", "second"):
@@ -226,9 +200,6 @@ def test_a_picture_has_the_same_bytes_twice(swirl: Path, tmp_path: Path) -> None
             paths.append(save(draw_frame(swirl, 2, kind="speed"), path))
         first, second = paths
         assert first.read_bytes() == second.read_bytes()
-    with xr.open_dataset(swirl) as data:
-        from_data = encode(draw_frame(data, 2, kind="speed"))
-    assert from_data == (tmp_path / "first.png").read_bytes()
 
 
 def test_plot_returns_a_figure_and_writes_a_file_only_where_asked(

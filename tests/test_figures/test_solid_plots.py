@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from drawn_scenarios import record
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
@@ -15,8 +16,8 @@ from lagbench.errors import UsageError
 from lagbench.figures.animate import draw_film
 from lagbench.figures.colours import MUTED
 from lagbench.figures.panels import Panel, draw, limit_of, place_of_slice
-from lagbench.figures.plot import choose_moments, draw_frame
-from lagbench.figures.recording import Recording, open_recording
+from lagbench.figures.plot import choose_moments, draw_scene
+from lagbench.figures.recording import Recording
 from lagbench.figures.solid import View
 
 FRAMES = 3
@@ -77,7 +78,7 @@ def texts_of(drawn: Figure) -> list[str]:
 
 def test_a_liquid_is_shown_from_three_sides() -> None:
     """Vorticity and streamlines of a splash say little: they come on request."""
-    words = texts_of(draw_frame(BLOCK, 2))
+    words = texts_of(draw_scene(record(BLOCK).scene(2)))
     for title in ("Particles by speed", "From the front", "From above"):
         assert title in words
 
@@ -85,28 +86,25 @@ def test_a_liquid_is_shown_from_three_sides() -> None:
 @pytest.mark.parametrize("kind", [Panel.VORTICITY, Panel.STREAMLINES])
 def test_a_slice_lies_where_the_liquid_is(kind: Panel) -> None:
     """The slice has the most nodes with a vorticity; the title says where it lies."""
-    with open_recording(BLOCK) as recording:
-        scene = recording.scene(2)
-        place = scene.fields.grid.spacing * scene.layer
-        assert 0.6 < place < 0.85
-        assert np.isfinite(scene.vorticity).sum() > 3
-        assert np.isfinite(limit_of(kind, scene))
-    words = texts_of(draw_frame(BLOCK, 2, kind=kind))
+    scene = record(BLOCK).scene(2)
+    place = scene.fields.grid.spacing * scene.layer
+    assert 0.6 < place < 0.85
+    assert np.isfinite(scene.vorticity).sum() > 3
+    assert np.isfinite(limit_of(kind, scene))
+    words = texts_of(draw_scene(record(BLOCK).scene(2), kind=kind))
     assert any(f"across z at {place:.2f}" in text for text in words)
 
 
 def test_where_material_is_too_thin_the_panel_says_so() -> None:
     """A film of liquid on the floor has no vorticity on the grid."""
-    with open_recording(FILM) as recording:
-        scene = recording.scene(2)
-        assert limit_of(Panel.VORTICITY, scene) == 0.0
-    words = texts_of(draw_frame(FILM, 2, kind=Panel.VORTICITY))
+    assert limit_of(Panel.VORTICITY, record(FILM).scene(2)) == 0.0
+    words = texts_of(draw_scene(record(FILM).scene(2), kind=Panel.VORTICITY))
     assert any("too thin" in text for text in words)
 
 
 def test_a_film_without_any_vorticity_is_refused() -> None:
-    with open_recording(FILM) as recording, pytest.raises(UsageError) as caught:
-        next(draw_film([recording], Panel.VORTICITY, [0]))
+    with pytest.raises(UsageError) as caught:
+        next(draw_film([record(FILM)], Panel.VORTICITY, [0]))
     assert caught.value.where == "--kind"
 
 
@@ -117,11 +115,11 @@ def layers_of(recording: Recording) -> set[int | None]:
 
 def test_a_film_shows_one_slice() -> None:
     """The slice of the best frame is that of all frames."""
-    with open_recording(BLOCK) as recording:
-        layers = layers_of(recording)
-        recording.fix_slice(range(FRAMES))
-        assert recording.layer in layers
-        assert layers_of(recording) == {recording.layer}
+    recording = record(BLOCK)
+    layers = layers_of(recording)
+    recording.fix_slice(range(FRAMES))
+    assert recording.layer in layers
+    assert layers_of(recording) == {recording.layer}
 
 
 @pytest.mark.parametrize(("frames", "steps"), [(32, 6), (150, 7), (800, 40)])
@@ -143,8 +141,7 @@ BALL = BLOCK.assign_attrs(
 def draw_ball(kind: Panel, scenario: xr.Dataset) -> NDArray[np.float64]:
     """Return the corners of the discs in a panel, shape [corner, 2]."""
     axes = Figure().add_subplot()
-    with open_recording(scenario) as recording:
-        draw(axes, kind, recording.scene(0), limit=1.0)
+    draw(axes, kind, record(scenario).scene(0), limit=1.0)
     corners = [np.empty((0, 2))]
     for patch in axes.patches:
         if isinstance(patch, Polygon) and to_hex(patch.get_facecolor()) == MUTED:
@@ -169,8 +166,7 @@ def test_a_view_shows_the_outline_of_an_obstacle(
 def test_a_slice_shows_the_cut_of_an_obstacle(kind: Panel) -> None:
     """A circle where the plane cuts it, and nothing where it passes by."""
     assert len(draw_ball(kind, BALL)) == 0
-    with open_recording(BLOCK) as recording:
-        cut = place_of_slice(recording.scene(0))
+    cut = place_of_slice(record(BLOCK).scene(0))
     met = BALL.assign_attrs(obstacle_z=cut + 0.06)
     from_centre = draw_ball(kind, met) - [0.7, 0.4]
     assert len(from_centre) > 0
@@ -180,8 +176,7 @@ def test_a_slice_shows_the_cut_of_an_obstacle(kind: Panel) -> None:
 @pytest.mark.parametrize("kind", [Panel.SPEED, Panel.MATERIAL])
 def test_a_cube_holds_its_obstacle(kind: Panel) -> None:
     """It stands where the view puts its centre, in the scale of the view."""
-    with open_recording(BALL) as recording:
-        view = View(recording.size.box)
+    view = View(record(BALL).size.box)
     from_centre = draw_ball(kind, BALL) - view.place(np.array([0.7, 0.4, 0.3]))
     assert len(from_centre) > 0
     np.testing.assert_allclose(

@@ -7,7 +7,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lagbench.figures.tables import escape, escape_prose, markdown
+from lagbench.figures.tables import escape, escape_prose
 
 ESCAPED = re.compile(r"\\([\\`*_\[\]<>|#&~$])")
 SPECIAL = re.compile(r"[`*_\[\]<>|#&~$]")
@@ -48,14 +48,3 @@ def test_prose_keeps_the_spaces_around_names_in_backticks() -> None:
 def test_prose_of_a_stranger_holds_no_link() -> None:
     prose = escape_prose("`a`![x](y) `b c` ``d``")
     assert prose == r"`a`!\[x\](y) \`b c\` \``d`\`"
-
-
-def test_tables_set_numbers_flush_right() -> None:
-    """Whole columns of numbers are flush right, with thousands apart."""
-    rows = [(1234, "`a_b`"), (5, "c_d")]
-    assert markdown(("n", "`code`|"), rows).splitlines() == [
-        r"| n | \`code\`\| |",
-        "| ---: | --- |",
-        "| 1,234 | `a_b` |",
-        r"| 5 | c\_d |",
-    ]

@@ -114,8 +114,7 @@ def test_substep_and_bounds_are_those_that_broke_first(
         monkeypatch.setattr(batch, "STRIDE", stride * stiff.particles)
         error = failure(stiff, (scenario,), tmp_path)
         assert error.where == f"{SPLIT} {SIZE}, scenario {scenario}, substep {substep}"
-        assert re.fullmatch(expected, str(error.expected))
-        assert re.fullmatch(got, str(error.got))
+        assert re.search(f"got {got}, expected {expected};", str(error))
     assert not list(tmp_path.rglob("*.nc*"))
 
 
@@ -171,7 +170,7 @@ def test_a_perturbed_run_is_replayed_with_its_perturbation(
     assert caught.value.where == "curl-noise tiny, scenario 3, substep 61"
     start = (size.task.input_frames - 1) * size.substeps_per_frame
     assert caught.value.where == f"{SPLIT} {SIZE}, scenario 3, substep {start + 1}"
-    assert caught.value.expected == "every number is finite"
+    assert "every number is finite" in str(caught.value)
 
 
 def test_a_failure_that_does_not_repeat_keeps_its_range(

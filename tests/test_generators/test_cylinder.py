@@ -168,22 +168,20 @@ def test_batches_carry_the_disc(tiny_split: Callable[..., GenerationResult]) -> 
 
 
 def test_pictures_show_the_disc(tiny_split: Callable[..., GenerationResult]) -> None:
-    """All corners of a polygon lie on its rim, from a file and from `open_split`."""
+    """All corners of a polygon lie on its rim."""
     root = tiny_split("cylinder").root
     size = SIZES["tiny"]
     path = size.path(root, size.subsets["test"][0])
-    with lagbench.open_split("cylinder", size="tiny", root=root) as data:
-        for source in (path, data.isel(scenario=0)):
-            with open_recording(source) as recording, figure(2.0, 2.0) as drawn:
-                axes = drawn.add_axes((0, 0, 1, 1))
-                draw_walls(axes, recording, 0)
-                discs = [patch for patch in axes.patches if isinstance(patch, Polygon)]
-                x, y, radius = data["obstacle"].isel(scenario=0).values
-                (disc,) = discs
-                corners = np.asarray(disc.get_xy())
-                distances = np.hypot(corners[:, 0] - x, corners[:, 1] - y)
-                np.testing.assert_allclose(distances, radius, rtol=1e-5)
-                np.testing.assert_allclose(corners[:-1].mean(axis=0), [x, y], atol=2e-3)
+    with open_recording(path) as recording, figure(2.0, 2.0) as drawn:
+        axes = drawn.add_axes((0, 0, 1, 1))
+        draw_walls(axes, recording, 0)
+        discs = [patch for patch in axes.patches if isinstance(patch, Polygon)]
+        x, y, radius = recording.obstacle
+    (disc,) = discs
+    corners = np.asarray(disc.get_xy())
+    distances = np.hypot(corners[:, 0] - x, corners[:, 1] - y)
+    np.testing.assert_allclose(distances, radius, rtol=1e-5)
+    np.testing.assert_allclose(corners[:-1].mean(axis=0), [x, y], atol=2e-3)
 
 
 def test_a_sheet_of_a_channel_is_low(

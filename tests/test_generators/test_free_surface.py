@@ -261,10 +261,10 @@ def test_what_is_not_a_number_is_reported(poison: float, device: Device) -> None
     with pytest.raises(WorkFailedError) as caught:
         solver.advance(20)
     assert caught.value.where == "scenario 0, substeps 0 to 20"
-    names_bound = "every number is finite" in str(caught.value.expected)
-    names_value = "NaN or an infinite number" in str(caught.value.got)
+    names_bound = "every number is finite" in str(caught.value)
+    names_value = "NaN or an infinite number" in str(caught.value)
     assert names_bound == names_value
-    assert "e+38" not in str(caught.value.got)
+    assert "e+38" not in str(caught.value)
     assert solver.position().min() >= np.float32(LOW)
 
 

@@ -17,7 +17,7 @@ from lagbench.data.manifest import (
     write_manifest,
 )
 from lagbench.data.registry import Size, load
-from lagbench.store.copy import gather, list_scenarios_to_gather
+from lagbench.store.copy import gather
 
 LIMIT = (1e-3, 2e-3)
 
@@ -78,8 +78,10 @@ def test_scenarios_that_the_size_lacks_stay_in_the_source(
     root = tmp_path / "root"
     source = tmp_path / "source"
     write_root(source, size, 3, 77)
-    assert list_scenarios_to_gather(size, root, source) == (3,)
-    joint = gather(size, root, source, merge_entries(size, None))
+    empty = merge_entries(size, None)
+    assert list_ids(gather(size, root, source, empty, dry_run=True)) == [3]
+    assert not root.exists()
+    joint = gather(size, root, source, empty)
     assert list_ids(joint) == [3]
     names = [path.name for path in root.rglob("*.nc")]
     assert names == ["0003.nc"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -76,17 +74,6 @@ def list_copy(url: str) -> list[str]:
     """Return the names of the working copy's files."""
     names = files(resolve_root(url))
     return sorted(name.removeprefix(f"{FOLDER}/") for name in names)
-
-
-def drop_entries(text: bytes, key: str, value: object) -> bytes:
-    """Return a manifest without the files of a scenario or subset."""
-    content = json.loads(text)
-    entries = []
-    for entry in content["files"]:
-        if entry[key] != value:
-            entries.append(entry)
-    content["files"] = entries
-    return json.dumps(content).encode()
 
 
 def open_and_close(root: str, **options: Any) -> None:
@@ -210,19 +197,6 @@ def test_other_content_is_refused(folder: Store, tiny: Registry, damage: str) ->
         lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
     assert caught.value.where == f"{folder.url}/{name}"
     assert set(list_copy(folder.url)) <= {"test/0004.nc"}
-
-
-def test_files_that_only_the_copy_has_stay_in_its_manifest(
-    folder: Store, tiny: Registry, generated: GenerationResult
-) -> None:
-    """A generation could not upload them yet."""
-    root = resolve_root(folder.url)
-    shutil.copytree(generated.root, root, dirs_exist_ok=True)
-    (root / FOLDER / "test/0003.nc").unlink()
-    manifest = folder.read(MANIFEST)
-    folder.put(MANIFEST, drop_entries(manifest, "subset", "train"))
-    open_and_close(folder.url)
-    assert (root / MANIFEST).read_bytes() == manifest
 
 
 def test_a_url_may_come_as_a_path() -> None:

@@ -34,10 +34,9 @@ from lagbench.figures.numbers import format_quantity, sentence, words
 from lagbench.figures.solid import View
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.frame import Snapshot
-from lagbench.metrics.metric import mean
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
-from .subject import Gallery, Moment, ReportEntry, ReportRow, Subject, limit_of
+from .subject import Gallery, Moment, ReportRow, Subject, limit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,10 +50,7 @@ ROW_NAME = 1.1  # room for the names of rows of panels [inch]
 TOLERATED = 3.0
 """Energies beyond so many times the truth's greatest energy are cut off."""
 
-MOST_ARROWS = 18  # across a panel
 MOST_SCENARIOS = 6  # whose particles are drawn over time
-MOST_NODES = 1600  # of a cloud of residuals
-BINS = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,11 +84,6 @@ def rollout_pictures(subject: Subject) -> Iterator[Picture]:
         rows = subject.rows_with(name)
         if rows:
             yield _draw_means(subject, rows, name, thesis)
-    for entry in subject.entries:
-        for name in (main_error, "position_rmse"):
-            score = entry.card.submission.get(name)
-            if score is not None:
-                yield _draw_scenarios(subject, entry, score)
 
 
 def _draw_means(
@@ -140,24 +131,6 @@ def _draw_means(
             title=f"{words(name, capital=True)} over frames",
             thesis=thesis,
             caption=f"{sentence(metric)} {note}.",
-            image=encode(drawn),
-        )
-
-
-def _draw_scenarios(subject: Subject, entry: ReportEntry, score: Score) -> Picture:
-    """Return a metric of one entry, a line per test scenario."""
-    metric = score.metric
-    with figure(6.4, 3.4) as drawn:
-        axes = _curve_axes(drawn, format_quantity(metric))
-        for number, values in enumerate(score.per_frame):
-            colour = SERIES[number % len(SERIES)]
-            _plot(axes, subject, values, color=colour, label="")
-        _choose_scale(axes)
-        return Picture(
-            name=f"scenarios-{metric.name.replace('_', '-')}-{entry.number}",
-            title=f"{words(metric.name, capital=True)}, every scenario: {entry.name}",
-            thesis="Fig. 5.10",
-            caption=f"{sentence(metric)} One line per scenario.",
             image=encode(drawn),
         )
 
@@ -220,7 +193,6 @@ def flow_pictures(subject: Subject, gallery: Gallery) -> Iterator[Picture]:
         image=_draw_maps(subject, columns, rows, [limit] * len(moments)),
         wide=True,
     )
-    yield _draw_arrows(subject, gallery, moments)
 
     frame = subject.key_frame
     moments = [gallery.moments[number, frame] for number in subject.scenarios]
@@ -279,61 +251,13 @@ def _draw_fields(subject: Subject, gallery: Gallery, moment: Moment) -> Picture:
     )
 
 
-def _draw_arrows(
-    subject: Subject, gallery: Gallery, moments: Sequence[Moment]
-) -> Picture:
-    """Return velocity arrows of truth and entries over time."""
-    grid = moments[0].truth.fields.section.grid
-    every = -(-max(grid.shape) // MOST_ARROWS)
-    place_x, place_y = np.meshgrid(grid.places(0), grid.places(1), indexing="ij")
-    flows = [[moment.truth.fields.section for moment in moments]]
-    for number in range(len(subject.entries)):
-        predicted = []
-        for moment in moments:
-            predicted.append(moment.pairs[number].predicted_fields.section)
-        flows.append(predicted)
-    speeds = [np.sqrt((flow.velocity**2).sum(axis=-1)) for flow in flows[0]]
-    limit = limit_of(speeds)
-    columns = [moment.title for moment in moments]
-    with _panels(columns, ["truth", *subject.names]) as (drawn, panels):
-        for row, row_flows in enumerate(flows):
-            for axes, flow, moment in zip(panels[row], row_flows, moments, strict=True):
-                is_counted = moment.truth.fields.section.counted
-                is_shown = np.zeros_like(is_counted)
-                is_shown[::every, ::every] = is_counted[::every, ::every]
-                u, v = np.moveaxis(flow.velocity[is_shown], -1, 0)
-                speed = np.hypot(u, v)
-                axes.quiver(
-                    place_x[is_shown],
-                    place_y[is_shown],
-                    u,
-                    v,
-                    speed,
-                    cmap=build_speed_map(),
-                    clim=(0.0, limit),
-                    scale=limit / (1.7 * every * grid.spacing),
-                    scale_units="xy",
-                    angles="xy",
-                    width=0.008,
-                )
-                _frame_panel(axes, subject)
-        image = encode(drawn)
-    return Picture(
-        name="arrows",
-        title="Velocity over time",
-        thesis="Figs. 5.22–5.24",
-        caption=f"{gallery.describe(moments[0].scenario)} Colour and length of arrows "
-        f"are the speed on the score grid, up to {limit:.3g} length/frame.",
-        image=image,
-        wide=True,
-    )
-
-
 def particle_pictures(subject: Subject, gallery: Gallery) -> Iterator[Picture]:
     """Yield particles by material over time, truth above predictions."""
     for scenario in subject.scenarios[:MOST_SCENARIOS]:
         moments = gallery.at(scenario, subject.times)
         interval = subject.task.size.frame_interval
+        numbers = np.unique(moments[0].truth.scenario.material)
+        materials = ", ".join(MATERIALS[number] for number in numbers)
         columns = [f"{moment.frame * interval:.3g} s" for moment in moments]
         names = ["truth", *subject.names]
         with _panels(columns, names) as (drawn, panels):
@@ -348,7 +272,7 @@ def particle_pictures(subject: Subject, gallery: Gallery) -> Iterator[Picture]:
             title=f"Particles of scenario {scenario}",
             thesis="Figs. 4.11–4.13",
             caption=f"{gallery.describe(scenario)} All particles by material "
-            f"({_name_materials(moments[0].truth)}), inside the walls of the box.",
+            f"({materials}), inside the walls of the box.",
             image=image,
             wide=True,
         )
@@ -360,89 +284,6 @@ def body_pictures(subject: Subject) -> Iterator[Picture]:
         rows = subject.rows_with(name)
         if rows:
             yield _draw_means(subject, rows, name, "section 4.8.2")
-
-
-def distribution_pictures(subject: Subject, gallery: Gallery) -> Iterator[Picture]:
-    """Yield the vorticity's distribution, its residuals, and metrics as bars."""
-    scenario = subject.scenarios[0]
-    frame = subject.key_frame
-    moment = gallery.moments[scenario, frame]
-    first_pair = moment.pairs[0]
-    if not first_pair.node_count:
-        return
-    truth = first_pair.true_vorticity
-    edges = np.linspace(*_range_of(truth), BINS + 1)
-    with figure(6.4, 3.4) as drawn:
-        axes = _curve_axes(drawn, "nodes [%]", x_label="vorticity [1/frame]")
-        axes.stairs(_shares(truth, edges), edges, color=INK, label="truth")
-        for entry, pair in zip(subject.entries, moment.pairs, strict=True):
-            predicted = pair.true_vorticity + pair.vorticity_residual
-            colour = SERIES[entry.number % len(SERIES)]
-            shares = _shares(predicted, edges)
-            axes.stairs(shares, edges, color=colour, label=entry.name)
-        axes.legend(frameon=False, fontsize=7)
-        yield Picture(
-            name="histogram",
-            title=f"Vorticity distribution at frame {frame}",
-            thesis="Figs. 5.12, 5.18",
-            caption=f"Scenario {scenario}. The outer bins hold all values beyond the "
-            "truth's range.",
-            image=encode(drawn),
-        )
-
-    step = -(-len(truth) // MOST_NODES)
-    with figure(6.4, 3.4) as drawn:
-        axes = _curve_axes(
-            drawn, "residual [1/frame]", x_label="true vorticity [1/frame]"
-        )
-        for entry, pair in zip(subject.entries, moment.pairs, strict=True):
-            axes.plot(
-                truth[::step],
-                pair.vorticity_residual[::step],
-                ".",
-                markersize=2,
-                color=SERIES[entry.number % len(SERIES)],
-                label=entry.name,
-            )
-        axes.axhline(0.0, color=MUTED, lw=0.8)
-        axes.legend(frameon=False, fontsize=7)
-        yield Picture(
-            name="residuals",
-            title="Residual against true vorticity",
-            thesis="Fig. 5.14",
-            caption=f"Predicted − true vorticity at the nodes, scenario {scenario}, "
-            f"frame {frame}. A cloud without slope around 0 is good; slope −1 means "
-            "that no rotation is predicted.",
-            image=encode(drawn),
-        )
-    for name in ("vorticity_pearson", "vorticity_kl"):
-        rows = subject.rows_with(name)
-        if rows:
-            yield _draw_bars(subject, rows, name)
-
-
-def _draw_bars(subject: Subject, rows: Sequence[ReportRow], name: str) -> Picture:
-    """Return a metric at the key frame, a bar per row."""
-    frame = subject.key_frame
-    metric = rows[0].scores[name].metric
-    with figure(6.4, 0.9 + 0.28 * len(rows)) as drawn:
-        axes = _curve_axes(drawn, "", x_label=format_quantity(metric))
-        for place, row in enumerate(reversed(rows)):
-            colour = MUTED
-            if row.entry is not None:
-                colour = SERIES[row.entry.number % len(SERIES)]
-            value = mean(row.scores[name].at(frame))
-            axes.barh(place, value, color=colour, height=0.6)
-        names = [row.name for row in reversed(rows)]
-        axes.set_yticks(range(len(rows)), names, fontsize=7)
-        axes.tick_params(axis="y", length=0)
-        return Picture(
-            name=f"bars-{name.replace('_', '-')}",
-            title=f"{words(name, capital=True)} at frame {frame}",
-            thesis="Figs. 5.13, 5.16",
-            caption=f"{sentence(metric)} Mean over {len(subject.scenarios)} scenarios.",
-            image=encode(drawn),
-        )
 
 
 def mean_over_scenarios(score: Score) -> Floats:
@@ -581,26 +422,3 @@ def _frame_panel(axes: Axes, subject: Subject) -> None:
     )
     for spine in axes.spines.values():
         spine.set_color(WALL)
-
-
-def _name_materials(snapshot: Snapshot) -> str:
-    """Return the materials of a scenario, in words."""
-    names = []
-    for number in np.unique(snapshot.scenario.material):
-        names.append(MATERIALS[number])
-    return ", ".join(names)
-
-
-def _range_of(values: Floats) -> tuple[float, float]:
-    low = float(values.min())
-    high = float(values.max())
-    if high <= low:
-        return low - 1.0, high + 1.0
-    return low, high
-
-
-def _shares(values: Floats, edges: Floats) -> Floats:
-    """Return per cent of values in each bin; the outer bins hold what lies beyond."""
-    inside = np.clip(values, edges[0], edges[-1])
-    counts, _ = np.histogram(inside, edges)
-    return 100.0 * counts / max(1, values.size)

@@ -119,12 +119,17 @@ def render(subject: Subject) -> str:
         lstrip_blocks=True,
     )
     header = subject.entries[0].card.header
+    size = subject.task.size
+    counts = {size.particle_count(scenario) for scenario in subject.scenarios}
+    particles = str(min(counts))
+    if len(counts) > 1:
+        particles = f"{min(counts)} to {max(counts)}"
     return environment.get_template("page.html").render(
         policy=POLICY,
         subject=subject,
         header=header,
         config=subject.task.config,
-        particles=_count_particles(subject),
+        particles=particles,
         tiles=_make_tiles(subject),
         sections=_draw_sections(subject, gallery),
         score_tables=tables.score_tables(subject),
@@ -139,7 +144,6 @@ def _draw_sections(
 ) -> list[tuple[str, list[pictures.Picture]]]:
     """Return the headings of the page's pictures, and the pictures."""
     rollout = list(pictures.rollout_pictures(subject))
-    vorticity = list(pictures.distribution_pictures(subject, gallery))
     energy = list(pictures.energy_pictures(subject))
     if subject.is_full_box:
         motion = ("The flow", list(pictures.flow_pictures(subject, gallery)))
@@ -149,18 +153,8 @@ def _draw_sections(
     return [
         ("Error over the rollout", rollout),
         motion,
-        ("Vorticity", vorticity),
         ("Energy", energy),
     ]
-
-
-def _count_particles(subject: Subject) -> str:
-    """Return how many particles the scenarios have: a number or a range."""
-    size = subject.task.size
-    counts = {size.particle_count(scenario) for scenario in subject.scenarios}
-    if len(counts) == 1:
-        return str(counts.pop())
-    return f"{min(counts)} to {max(counts)}"
 
 
 def _make_tiles(subject: Subject) -> list[Tile]:

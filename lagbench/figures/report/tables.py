@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.figures.numbers import format_unit, text, words
-from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, Metric, mean
-from lagbench.metrics.significance import compare, standings
 from lagbench.metrics.table import CHOSEN, FAMILIES, METRICS
 
 from .subject import Subject
@@ -66,11 +64,10 @@ class ReportTable:
 
 
 def score_tables(subject: Subject) -> list[ReportTable]:
-    """Return the tables of the chosen metrics, the ranking, a frame, the scenarios."""
+    """Return the tables of the chosen metrics, of a frame, of the scenarios."""
     names = dict.fromkeys((subject.ranking.name, *CHOSEN))
     return [
         _horizon_table(subject, "Mean over the horizon", _measured(subject, names)),
-        _ranking_table(subject),
         _frame_table(subject),
         _scenario_table(subject),
     ]
@@ -111,35 +108,25 @@ def _horizon_table(subject: Subject, title: str, names: Sequence[str]) -> Report
         for score in scores:
             values.append(np.array([]) if score is None else score.values)
         best = _find_best(metric, values)
-        cells = [_metric_cell(metric)]
+        aim = AIMS.get(metric.direction, f"aims at {metric.perfect:g}")
+        note = f"{metric.summary}; {aim}"
+        cells = [ReportCell(f"{metric.name}{format_unit(metric)}", note)]
         for column, score in enumerate(scores):
-            cells.append(_score_cell(score, is_best=column in best))
-            has_undefined |= score is not None and sum(score.undefined) > 0
+            if score is None:
+                cells.append(ReportCell(""))
+                continue
+            shown = text(score.mean)
+            if sum(score.undefined):
+                shown += UNDEFINED
+                has_undefined = True
+            interval = format_interval(score.interval)
+            cells.append(ReportCell(shown, interval, column in best))
         rows.append(cells)
     note = ""
     if has_undefined:
         note = f"{UNDEFINED} Some frames have no value; the mean leaves them out."
     head = ["metric", *(row.name for row in subject.rows)]
     return ReportTable(title, head, rows, note)
-
-
-def _metric_cell(metric: Metric) -> ReportCell:
-    """Return name and unit of a metric, and what it measures."""
-    if metric.direction is Direction.TARGET:
-        aim = f"aims at {metric.perfect:g}"
-    else:
-        aim = AIMS[metric.direction]
-    return ReportCell(f"{metric.name}{format_unit(metric)}", f"{metric.summary}; {aim}")
-
-
-def _score_cell(score: Score | None, *, is_best: bool) -> ReportCell:
-    """Return a mean with its interval."""
-    if score is None:
-        return ReportCell("")
-    shown = text(score.mean)
-    if sum(score.undefined):
-        shown += UNDEFINED
-    return ReportCell(shown, format_interval(score.interval), is_best)
 
 
 def format_interval(bounds: tuple[float, float]) -> str:
@@ -203,49 +190,3 @@ def _scenario_table(subject: Subject) -> ReportTable:
         )
     title = f"{words(metric.name, capital=True)} per scenario"
     return ReportTable(title, ["method", *map(str, subject.scenarios)], rows)
-
-
-def _ranking_table(subject: Subject) -> ReportTable:
-    """Return every method beside the best entry; only entries have a rank.
-
-    Tests are sign-flip tests, corrected by Holm.
-    """
-    name = subject.ranking.name
-    scores = {}
-    for row in subject.rows:
-        if row.entry is not None:
-            scores[row.name] = row.scores[name]
-    ranked = standings(scores)
-    best_entry = next(iter(ranked))
-    best_score = scores[best_entry]
-    rows = []
-    for row in subject.rows:
-        score = row.scores[name]
-        if row.name == best_entry and row.entry is not None:
-            cells = [row.name, "1", text(score.mean), "", "", ""]
-        else:
-            comparison = compare(score, best_score)
-            difference = text(comparison.difference)
-            interval = format_interval(comparison.interval)
-            if row.entry is None:
-                cells = [row.name, "", text(score.mean), difference, interval, ""]
-            else:
-                standing = ranked[row.name]
-                rank = str(standing.rank)
-                p = text(standing.p)
-                cells = [row.name, rank, text(score.mean), difference, interval, p]
-        rows.append([ReportCell(cell) for cell in cells])
-    head = [
-        "method",
-        "rank",
-        words(name),
-        "loss − loss of the best submission",
-        "95 % interval",
-        "p",
-    ]
-    note = (
-        f"p: exact two-sided sign-flip test over {len(subject.scenarios)} scenarios, "
-        "corrected by Holm. It is about these weights: other seeds may stand otherwise."
-    )
-    title = f"Ranking by {words(name)}"
-    return ReportTable(title, head, rows, note)
