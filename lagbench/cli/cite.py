@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib.metadata import version
 
 from lagbench.data.local import locate_split
-from lagbench.data.registry import Registry, Split, default_path, load
+from lagbench.data.registry import Split, default_path, load
 from lagbench.errors import escape_line
 
 from .options import JsonFlag, RootOption
@@ -68,7 +68,9 @@ def cite_command(
         measured = registry.size(name, size).measured
         if measured is not None:
             hashes[size] = measured.dataset_sha256
-    is_foreign = not _is_ours(name, registry)
+    path = registry.files.get(name)
+    # of a user or another package
+    is_foreign = path is None or path.resolve() != default_path().resolve()
     if bibtex:
         text = _split_bibtex(name, entry, hashes, is_foreign=is_foreign)
         print_result({"bibtex": text}, [text], as_json=as_json)
@@ -101,12 +103,6 @@ def cite_command(
     for size, sha256 in hashes.items():
         lines.append(f"Data set hash of size {size}: {sha256}")
     print_result(citation, lines, as_json=as_json)
-
-
-def _is_ours(split: str, registry: Registry) -> bool:
-    """Return whether a split is one of lagbench, not of a user or another package."""
-    path = registry.files.get(split)
-    return path is not None and path.resolve() == default_path().resolve()
 
 
 def _cite_program(*, bibtex: bool, as_json: bool) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from lagbench.data.box import describe_bounds
 from lagbench.data.layout import (
@@ -15,7 +15,6 @@ from lagbench.data.layout import (
     refuse_closed_folder,
     url_of,
 )
-from lagbench.data.limits import Value
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
 from lagbench.errors import LagbenchError, escape_line, hide_credentials
@@ -189,7 +188,9 @@ def info_command(
         sizes = {}
         for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
             sizes[shown_size.name] = _size_as_json(shown_size, size_overview)
-        print_json({"split": name, **_split_as_json(entry), "sizes": sizes})
+        facts = ("version", "title", "description", "citation", "licence")
+        description = {fact: getattr(entry, fact) for fact in facts}
+        print_json({"split": name, **description, "sizes": sizes})
         return
 
     description = textwrap.fill(entry.description, TEXT_WIDTH, break_on_hyphens=False)
@@ -201,18 +202,16 @@ def info_command(
     print_line("")
     print_table("Sizes", COLUMNS, map(_format_row, overviews))
     print_line("")
-    _print_parameters(entry, all_sizes)
-
-
-def _split_as_json(entry: Split) -> dict[str, Any]:
-    """Return what the JSON of info says of a split as a whole."""
-    return {
-        "version": entry.version,
-        "title": entry.title,
-        "description": entry.description,
-        "citation": entry.citation,
-        "licence": entry.licence,
-    }
+    rows = []
+    for parameter_name, parameter in entry.parameters.items():
+        values = []
+        for one in all_sizes:
+            known = one.parameters.get(parameter_name)
+            values.append(known.value if known else "-")
+        meaning = escape_line(f"[{parameter.unit}] {parameter.description}")
+        rows.append((escape_line(parameter_name), *values, meaning))
+    columns = ("name", *entry.sizes, "[unit] meaning")
+    print_table("Parameters", columns, rows)
 
 
 def _size_as_json(size: Size, size_overview: Overview) -> dict[str, Any]:
@@ -231,23 +230,6 @@ def _size_as_json(size: Size, size_overview: Overview) -> dict[str, Any]:
         "refinement": size.refinement,
         "truth_error": size.truth_error,
     }
-
-
-def _print_parameters(entry: Split, sizes: Sequence[Size]) -> None:
-    rows = []
-    for name, parameter in entry.parameters.items():
-        values = [_value_of(size, name) for size in sizes]
-        meaning = escape_line(f"[{parameter.unit}] {parameter.description}")
-        rows.append((escape_line(name), *values, meaning))
-    columns = ("name", *entry.sizes, "[unit] meaning")
-    print_table("Parameters", columns, rows)
-
-
-def _value_of(size: Size, name: str) -> Value:
-    """Return a parameter's value; a dash where the size does without."""
-    if name not in size.parameters:
-        return "-"
-    return cast("Value", size.value(name))
 
 
 def _describe_size(size: Size, size_overview: Overview) -> Iterator[str]:

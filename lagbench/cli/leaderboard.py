@@ -5,7 +5,7 @@ They are build, check, picture, reproduce, shift and show.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveInt
 
 from lagbench.atomic import check_output_file
-from lagbench.board.blind import BlindScore, score_blind
+from lagbench.board.blind import score_blind
 from lagbench.board.check import CheckResult, check_board
 from lagbench.board.collect import collect, list_data_sets
 from lagbench.board.folder import Folder
@@ -215,9 +215,20 @@ def reproduce_command(
                 root=root,
                 progress=progress,
             )
-        print_result(scores, _describe_blind(scores), as_json=as_json, quiet=quiet)
+        lines = []
+        for one in scores:
+            lines.append(
+                f"{one.name}: skill {one.public_skill:.3f} on test, "
+                f"{one.blind_skill:.3f} on the new scenarios"
+            )
+        print_result(scores, lines, as_json=as_json, quiet=quiet)
         return 0
     folder = find_board(board)
+
+    def time_solver(split: str, size: str) -> float | None:
+        solver = try_bench(split, size, warning="the solver is not timed")
+        return solver.seconds_per_frame if solver else None
+
     with progress_bar(quiet=quiet or as_json) as progress:
         if recording and not quiet:
             progress = note_at_start(f"results go to {folder}", progress)
@@ -233,7 +244,7 @@ def reproduce_command(
             recording=recording,
             threads=threads,
             root=root,
-            time_solver=_time_solver,
+            time_solver=time_solver,
             progress=progress,
         )
     if not as_json:
@@ -242,22 +253,6 @@ def reproduce_command(
     lines = _describe_reproduced(result, with_scores=not costs, with_costs=not no_costs)
     print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
     return result.exit_code
-
-
-def _describe_blind(scores: Sequence[BlindScore]) -> Iterator[str]:
-    for one in scores:
-        yield (
-            f"{one.name}: skill {one.public_skill:.3f} on test, "
-            f"{one.blind_skill:.3f} on the new scenarios"
-        )
-
-
-def _time_solver(split: str, size: str) -> float | None:
-    """Return the solver's time of a frame [s], None where it cannot run."""
-    solver = try_bench(split, size, warning="the solver is not timed")
-    if solver is None:
-        return None
-    return solver.seconds_per_frame
 
 
 def _describe_reproduced(

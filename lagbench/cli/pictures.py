@@ -57,7 +57,11 @@ def plot_command(
         output: File to write; by default named after the data.
     """
     if sheet:
-        _refuse_choice_of_one(scenario, frame)
+        if scenario is not None or frame is not None:
+            raise UsageError(
+                "a sheet shows many scenarios and frames; leave --scenario and --frame "
+                "out, or --sheet"
+            )
         tier = locate(split, size, root=root).size
         page = Path(f"{tier.split}-{tier.name}-sheet.png")
         if output is not None:
@@ -78,20 +82,6 @@ def plot_command(
             root=root,
         )
     print_result({"output": path}, [str(path)], as_json=as_json, quiet=quiet)
-
-
-def _refuse_choice_of_one(scenario: int | None, frame: int | None) -> None:
-    """Refuse a scenario or a frame beside --sheet, which would be left out in silence.
-
-    Raises:
-        UsageError: one of them is given.
-    """
-    for name, number in (("--scenario", scenario), ("--frame", frame)):
-        if number is not None:
-            raise UsageError(
-                f"a sheet shows many scenarios and frames; leave {name} or --sheet out",
-                where=f"--sheet and {name}",
-            )
 
 
 def animate_command(

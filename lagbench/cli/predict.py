@@ -31,7 +31,6 @@ LARGEST_SEED = 2**31 - 1
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
-    from lagbench.models.predict_onnx import OnnxPredictionResult
 
 
 def predict_command(
@@ -75,31 +74,45 @@ def predict_command(
     time_solver = solver_clock if bench else None
     if checkpoint.suffix == ".onnx":
         check_regular(checkpoint)
-        _refuse_options_of_weights(
-            settings=settings, device=device, threads=threads, batch=batch
-        )
-        onnx_result = _predict_onnx(
-            checkpoint,
-            output,
-            overwrite=overwrite,
-            split=split,
-            size=size,
-            subset=subset,
-            method=method,
-            seed=seed or 0,
-            root=root,
-            time_solver=time_solver,
-            quiet=quiet,
-        )
+        has_other_device = device not in ("auto", "cpu") or threads not in (None, 1)
+        if settings or batch is not None or has_other_device:
+            raise UsageError(
+                "--set, --device, --threads and --batch change nothing for an ONNX "
+                "file; leave them out"
+            )
+        from lagbench.models.predict_onnx import predict_onnx
+
+        with progress_bar(quiet=quiet) as progress:
+            onnx_result = predict_onnx(
+                checkpoint,
+                output,
+                overwrite=overwrite,
+                split=split,
+                size=size,
+                subset=subset,
+                method=method,
+                seed=seed or 0,
+                root=root,
+                time_solver=time_solver,
+                progress=progress,
+            )
+        value = {**vars(onnx_result), "solver": solver_clock.bench}
         lines = [
-            *_describe_onnx(onnx_result, solver=solver_clock.bench),
+            f"{onnx_result.path}: {onnx_result.method}, "
+            f"{format_count(onnx_result.scenarios, 'scenario')}, "
+            f"{onnx_result.frames} frames",
+            f"  model   {onnx_result.seconds_per_frame:.3g} s per frame: processor "
+            "time of one thread, mean over all predicted frames",
+            *_describe_solver(onnx_result.seconds_per_frame, solver_clock.bench),
             _next_command(onnx_result.path, split, root),
         ]
-        value = {**vars(onnx_result), "solver": solver_clock.bench}
         print_result(value, lines, as_json=as_json, quiet=quiet)
         return
 
-    _refuse_stated_seed(seed)
+    if seed is not None:
+        raise UsageError(
+            "weights state the seed of their training; leave it out", where="--seed"
+        )
     require_libraries(PREDICTION_LIBRARIES)
     from lagbench.baselines.predict import predict
 
@@ -130,67 +143,6 @@ def predict_command(
     print_result(value, lines, as_json=as_json, quiet=quiet)
 
 
-def _refuse_options_of_weights(
-    *,
-    settings: list[str] | None,
-    device: str,
-    threads: int | None,
-    batch: int | None,
-) -> None:
-    """Refuse options that change nothing for an ONNX file."""
-    is_given = {
-        "--set": bool(settings),
-        "--device": device not in {"auto", "cpu"},
-        "--threads": threads not in {None, 1},
-        "--batch": batch is not None,
-    }
-    for name, is_there in is_given.items():
-        if is_there:
-            raise UsageError("not with an ONNX file; leave it out", where=name)
-
-
-def _refuse_stated_seed(seed: int | None) -> None:
-    """Refuse a seed for weights, which state the seed of their training."""
-    if seed is not None:
-        raise UsageError(
-            "weights state the seed of their training; leave it out",
-            where="--seed",
-        )
-
-
-def _predict_onnx(
-    model: Path,
-    output: Path,
-    *,
-    overwrite: bool,
-    split: str | None,
-    size: str | None,
-    subset: str,
-    method: str | None,
-    seed: int,
-    root: str | Path | None,
-    time_solver: _SolverClock | None,
-    quiet: bool,
-) -> OnnxPredictionResult:
-    """Predict with an ONNX file."""
-    from lagbench.models.predict_onnx import predict_onnx
-
-    with progress_bar(quiet=quiet) as progress:
-        return predict_onnx(
-            model,
-            output,
-            overwrite=overwrite,
-            split=split,
-            size=size,
-            subset=subset,
-            method=method,
-            seed=seed,
-            root=root,
-            time_solver=time_solver,
-            progress=progress,
-        )
-
-
 class _SolverClock:
     """Times our solver when it is called, and keeps the result."""
 
@@ -205,18 +157,6 @@ class _SolverClock:
         if self.bench is None:
             return None
         return self.bench.seconds_per_frame
-
-
-def _describe_onnx(
-    result: OnnxPredictionResult, *, solver: SolverBench | None
-) -> Iterator[str]:
-    scenarios = format_count(result.scenarios, "scenario")
-    yield f"{result.path}: {result.method}, {scenarios}, {result.frames} frames"
-    yield (
-        f"  model   {result.seconds_per_frame:.3g} s per frame: processor time of one "
-        "thread, mean over all predicted frames"
-    )
-    yield from _describe_solver(result.seconds_per_frame, solver)
 
 
 def _describe(
@@ -238,7 +178,10 @@ def _describe(
         yield "  in place of the predictions that were there"
     cost = f"{result.seconds_per_frame:.3g} s per frame"
     yield f"  model   {cost} on {result.device}"
-    yield f"          {_describe_clock(result)}"
+    clock = f"{result.wall_seconds_per_frame:.3g} s on the wall"
+    if result.clock != "wall":
+        clock = f"processor time of {format_count(result.threads, 'thread')}; {clock}"
+    yield f"          {clock}"
     yield from _describe_solver(result.seconds_per_frame, solver)
     if result.diverged:
         marks = []
@@ -254,37 +197,13 @@ def _describe_solver(
     if solver is None:
         return
     ratio = seconds_per_frame / solver.seconds_per_frame
+    speeds = f"{ratio:.2g} times as fast as the model"
+    if ratio < 1.0:
+        speeds = f"the model is {1.0 / ratio:.2g} times as fast"
     yield (
         f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this "
-        f"machine: {_compare_speeds(ratio)}"
+        f"machine: {speeds}"
     )
-
-
-def _compare_speeds(ratio: float) -> str:
-    """Return how fast the solver is, from the time of the model over its own.
-
-    >>> for ratio in (4.0, 0.25, 1.04):
-    ...     print(_compare_speeds(ratio))
-    4 times as fast as the model
-    the model is 4 times as fast
-    as fast as the model
-    """
-    slowdown = _format_ratio(ratio)
-    speed_up = _format_ratio(1 / ratio)
-    if "1" in (slowdown, speed_up):
-        return "as fast as the model"
-    if ratio > 1:
-        return f"{slowdown} times as fast as the model"
-    return f"the model is {speed_up} times as fast"
-
-
-def _describe_clock(result: PredictionResult) -> str:
-    """Return which clock took the time of a model, and what else the machine did."""
-    wall = f"{result.wall_seconds_per_frame:.3g} s on the wall"
-    if result.clock == "wall":
-        return wall
-    threads = format_count(result.threads, "thread")
-    return f"processor time of {threads}; {wall}"
 
 
 def _next_command(path: Path, split: str | None, root: str | Path | None) -> str:
@@ -295,14 +214,3 @@ def _next_command(path: Path, split: str | None, root: str | Path | None) -> str
     elif root:
         options = f" --root {quote_root(root)}"
     return f"next: lagbench score {shlex.quote(str(path))}{options}"
-
-
-def _format_ratio(ratio: float) -> str:
-    """Return a ratio with two digits, or as a whole number.
-
-    >>> _format_ratio(1.234), _format_ratio(463.2)
-    ('1.2', '463')
-    """
-    if ratio < 10:
-        return f"{ratio:.2g}"
-    return f"{ratio:.0f}"

@@ -64,7 +64,12 @@ def score_command(
     """
     extra_names = tuple(name for name in extras.split(",") if name)
     check_extras(extra_names)
-    _check_file_count(predictions, report)
+    if len(predictions) > 1 and report is None:
+        raise UsageError(
+            "several files are scored together for a report only; add --report FOLDER, "
+            "or score one after the other",
+            where="FILE",
+        )
     folders = _score_folders(predictions, output)
     data_root: str | Path | None = root
     if split is not None:
@@ -98,33 +103,12 @@ def score_command(
             page = write_report(report, cards, predictions, root=data_root)
     finally:
         if as_json:
-            _print_cards_as_json(cards)
+            values = [card.as_json() for card in cards]
+            print_json(values[0] if len(values) == 1 else values)
         elif not quiet:
             _print_cards(cards, every=every)
     if page is not None:
         print_line(f"report: {page}", quiet=quiet or as_json)
-
-
-def _check_file_count(predictions: Sequence[Path], report: Path | None) -> None:
-    """Refuse several files that are to be scored without a report.
-
-    Raises:
-        UsageError: there are several files and no folder of a report.
-    """
-    if len(predictions) > 1 and report is None:
-        raise UsageError(
-            "several files are scored together for a report only; add --report FOLDER, "
-            "or score one after the other",
-            where="FILE",
-        )
-
-
-def _print_cards_as_json(cards: Sequence[ScoreCard]) -> None:
-    """Print the scores of one file as an object, those of several as a list."""
-    if len(cards) == 1:
-        print_json(cards[0].as_json())
-    else:
-        print_json([card.as_json() for card in cards])
 
 
 def _print_cards(cards: Sequence[ScoreCard], *, every: bool) -> None:

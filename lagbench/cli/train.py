@@ -14,7 +14,6 @@ from cyclopts import Parameter
 from cyclopts.types import NonNegativeInt
 
 from lagbench.data.local import locate
-from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, format_count
 from lagbench.scoring.scorability import check_scorability
 from lagbench.submission.budget import EQUAL_MINUTES
@@ -162,16 +161,20 @@ def _errors_of_one_process(*, is_helper: bool) -> Iterator[None]:
         raise SystemExit(error.exit_code) from error
 
 
-def _has_mini(split: str) -> bool:
-    """Tell whether a split of ours or of a package has the size mini."""
-    splits = load().splits
-    return split in splits and "mini" in splits[split].sizes
-
-
 def _describe(result: TrainingResult, data_option: str) -> Iterator[str]:
+    time = (
+        f"{format_seconds(result.wall_seconds)}, {format_seconds(result.cpu_seconds)} "
+        "of processor time"
+    )
+    if result.gpu_seconds:
+        time += f", {format_seconds(result.gpu_seconds)} of GPU time"
+    if result.first_step == result.step:
+        time += "; the training was over before, --fresh trains anew"
+    elif result.first_step:
+        time += f"; this call went on from step {result.first_step}"
     yield (
         f"{result.baseline} on {result.recipe}: {result.state}, "
-        f"step {result.step} of {result.steps}, {_describe_time(result)}"
+        f"step {result.step} of {result.steps}, {time}"
     )
     if result.start:
         yield (
@@ -179,97 +182,29 @@ def _describe(result: TrainingResult, data_option: str) -> Iterator[str]:
             "hours and track count the training of these weights too"
         )
     yield f"  parameters {result.parameters}"
-    yield _describe_learning(result)
+    # the sum of a loss's terms last
+    terms = sorted(result.loss, key=lambda term: (term == "total", term))
+    values = ", ".join(f"{term} {result.loss[term]:.4g}" for term in terms)
+    yield f"  {'fit ' if result.is_fitted else 'loss'}       {values}"
     if result.best_value is not None:
         best = f"{result.best_value:.4g} on valid, step {result.best_step}"
         if result.best_step == 0:
             best += ": nothing better than the weights that it started from"
         yield f"  best       {result.metric} {best}"
-    yield f"  budget     {_describe_budget(result)}"
+    validation_share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
+    minutes = EQUAL_MINUTES.get(result.size)
+    track = f"track: {result.track}"
+    if result.track is None:
+        track = "no track: it has not converged"
+        if minutes is not None:
+            track += f", nor is it equal compute ({minutes:.0f} min without a GPU)"
+    yield (
+        f"  budget     {result.windows_seen or 0:,} windows, {result.epochs:.3g} "
+        f"epochs; {validation_share:.0%} of the processor time for validations; "
+        f"{result.device}, {format_count(result.threads, 'thread')}; {track}"
+    )
     yield f"  weights    {result.weights}"
     if result.size == "tiny":
-        hint = "hint: tiny is for tests: it is too small to learn from"
-        if _has_mini(result.split):
-            hint += "; try --size mini"
-        yield hint
+        yield "hint: tiny is for tests: it is too small to learn from"
     weights = shlex.quote(str(result.weights))
     yield f"next: lagbench predict {weights}{data_option} -o predictions.nc"
-
-
-def _describe_time(result: TrainingResult) -> str:
-    wall_time = format_seconds(result.wall_seconds)
-    cpu_time = format_seconds(result.cpu_seconds)
-    text = f"{wall_time}, {cpu_time} of processor time"
-    if result.gpu_seconds:
-        text += f", {format_seconds(result.gpu_seconds)} of GPU time"
-    if result.first_step == result.step:
-        text += "; the training was over before, --fresh trains anew"
-    elif result.first_step:
-        text += f"; this call went on from step {result.first_step}"
-    return text
-
-
-def _describe_learning(result: TrainingResult) -> str:
-    """Return the terms of the loss, their sum last; of a fit the learned numbers."""
-    if result.is_fitted:
-        numbers = [f"{name} {value:.4g}" for name, value in result.loss.items()]
-        return f"  fit        {', '.join(numbers)}"
-
-    terms = sorted(result.loss)
-    if "total" in terms:
-        terms.remove("total")
-        terms.append("total")
-    values = [f"{term} {result.loss[term]:.4g}" for term in terms]
-    return f"  loss       {', '.join(values)}"
-
-
-def _describe_budget(result: TrainingResult) -> str:
-    windows = ""
-    if result.windows_seen:
-        windows = f"{result.windows_seen:,} windows, "
-    validation_share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
-    return (
-        f"{windows}{_describe_epochs(result.epochs)}; "
-        f"{validation_share:.0%} of the processor time for validations; "
-        f"{result.device}, {format_count(result.threads, 'thread')}; "
-        f"{_describe_track(result)}"
-    )
-
-
-def _describe_epochs(epochs: float) -> str:
-    """Return a number of epochs in words.
-
-    >>> _describe_epochs(1.0004), _describe_epochs(1.5)
-    ('1 epoch', '1.5 epochs')
-    """
-    number = _format_number(epochs)
-    if number == "1":
-        return "1 epoch"
-    return f"{number} epochs"
-
-
-def _format_number(value: float) -> str:
-    """Return a number with three digits, and all digits before the point.
-
-    >>> _format_number(1.21124), _format_number(1234.4)
-    ('1.21', '1,234')
-    """
-    if value < 999.5:
-        return f"{value:.3g}"
-    return f"{value:,.0f}"
-
-
-def _describe_track(result: TrainingResult) -> str:
-    """Return what the leaderboard will call the training, and of none the reason."""
-    if result.track is not None:
-        return f"track: {result.track}"
-    minutes = EQUAL_MINUTES.get(result.size)
-    if minutes is None:
-        return (
-            f"no track: it has not converged, and {result.size} has no limit of "
-            "equal compute"
-        )
-    return (
-        "no track: neither equal compute (no GPU, at most "
-        f"{minutes:.0f} min of processor time) nor converged"
-    )

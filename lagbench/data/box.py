@@ -293,8 +293,7 @@ class Box:
         points = np.asarray(position)
         above = points >= np.asarray(self.low) - tolerance
         below = points <= np.asarray(self.high) + tolerance
-        finite = np.isfinite(points)
-        along_axis = np.where(self.periodic, finite, above & below)
+        along_axis = np.where(self.periodic, np.isfinite(points), above & below)
         return np.asarray(along_axis.all(axis=-1))
 
 

@@ -149,8 +149,7 @@ class Grid:
     def middle_layer(self) -> int:
         """Number along z of the nodes of the middle plane, in three dimensions."""
         height = self.places(2) - self.box.centre[2]
-        distance = np.abs(height)
-        return int(np.argmin(distance))
+        return int(np.argmin(np.abs(height)))
 
     @property
     def start(self) -> Floats:
@@ -159,9 +158,7 @@ class Grid:
 
     def places(self, axis: int) -> Floats:
         """Return the positions of the nodes along an axis [length], shape [node]."""
-        number = np.arange(self.shape[axis])
-        steps = number + self.origin
-        distance = steps / self.cells
+        distance = (np.arange(self.shape[axis]) + self.origin) / self.cells
         return np.asarray(self.start[axis] + distance, np.float64)
 
     @property
@@ -184,8 +181,7 @@ class Grid:
     @property
     def axis(self) -> Floats:
         """Positions of the nodes along an axis with walls [length], shape [nodes]."""
-        steps = np.arange(self.nodes) + self.origin
-        return steps / self.cells
+        return (np.arange(self.nodes) + self.origin) / self.cells
 
     def full_weight(self, particles: int, area: float) -> float:
         """Return the weight ``N h^d / A`` of a node deep inside the material [1].
@@ -194,8 +190,7 @@ class Grid:
             particles: particles N of the scenario.
             area: area or volume A that they cover at first [length^d].
         """
-        cell_volume = self.spacing**self.dimension
-        return particles * cell_volume / area
+        return particles * self.spacing**self.dimension / area
 
 
 @dataclass(frozen=True)
@@ -349,9 +344,7 @@ def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     """
     periodic = np.asarray(grid.box.periodic)
     x = grid.box.wrap(x)
-    is_finite = np.isfinite(x)
-    is_between_walls = (x >= 0.0) & (x <= 1.0)
-    is_axis_inside = np.where(periodic, is_finite, is_between_walls)
+    is_axis_inside = np.where(periodic, np.isfinite(x), (x >= 0.0) & (x <= 1.0))
     is_inside = is_axis_inside.all(axis=1)
     if not is_inside.all():
         x = x[is_inside]
@@ -372,10 +365,8 @@ def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     # target is shifted to the other nodes instead.
     padded_shape = tuple(count + _ROWS_BELOW + _ROWS_ABOVE for count in grid.shape)
     strides = np.ones(len(padded_shape), np.intp)
-    last_axis_first = np.cumprod(padded_shape[:0:-1])
-    strides[:-1] = last_axis_first[::-1]
-    padded_base = base.T + _ROWS_BELOW
-    corner = (padded_base @ strides).astype(np.intp)
+    strides[:-1] = np.cumprod(padded_shape[:0:-1])[::-1]
+    corner = ((base.T + _ROWS_BELOW) @ strides).astype(np.intp)
     size = int(np.prod(padded_shape))
     largest_shift = 2 * int(strides.sum())
     sums = np.zeros((pair_count, size + largest_shift), np.complex128)
@@ -414,8 +405,7 @@ def _fold(padded: Floats, grid: Grid) -> Floats:
     """
     for axis, is_periodic in enumerate(grid.box.periodic):
         along = np.moveaxis(padded, axis, 0)
-        end = _ROWS_BELOW + grid.shape[axis]
-        inner = along[_ROWS_BELOW:end].copy()
+        inner = along[_ROWS_BELOW : _ROWS_BELOW + grid.shape[axis]].copy()
         if is_periodic:
             inner[-_ROWS_BELOW:] += along[:_ROWS_BELOW]
             inner[:_ROWS_ABOVE] += along[-_ROWS_ABOVE:]
@@ -435,8 +425,7 @@ def _scatter_between_walls(x: Floats, u: Floats, grid: Grid, out: Floats) -> Non
     # NaN is not inside either.
     all_inside = x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
     if not all_inside:
-        is_axis_inside = (x >= 0.0) & (x <= 1.0)
-        is_inside = is_axis_inside.all(axis=1)
+        is_inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
         x = x[is_inside]
         u = u[is_inside]
     base, weights = _spline_weights(x, grid)
@@ -502,8 +491,7 @@ def counted_nodes(weight: Floats, full: float) -> Mask:
 
 def node_velocity(sums: Transfer, full: float) -> Floats:
     """Return ``sum(w u) / sum(w)``; 0 below :data:`EMPTY_SHARE` of the full weight."""
-    least_weight = EMPTY_SHARE * full
-    is_filled = (sums.weight >= least_weight) & (sums.weight > 0.0)
+    is_filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
     divisor = sums.weight[..., None]
     velocity = np.zeros_like(sums.momentum)
     np.divide(sums.momentum, divisor, out=velocity, where=is_filled[..., None])

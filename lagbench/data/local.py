@@ -13,11 +13,10 @@ strangers carry names only: a path is understood where the user gives one, in
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,7 +46,7 @@ from .layout import (
     url_of,
     working_copy_of,
 )
-from .manifest import Manifest, read_or_empty
+from .manifest import read_or_empty
 from .registry import (
     NO_GENERATOR,
     Measured,
@@ -102,47 +101,18 @@ def resolve_root(root: str | Path | None = None) -> Path:
         return folder
     url = as_url(named_root)
     if url is not None:
-        return _make_working_copy(url)
+        copy = working_copy_of(url)
+        if url_of(copy) != url:
+            text = json.dumps({"url": url}, indent=1) + "\n"
+            write_atomically(copy / STORE_FILE, text.encode(), option=CACHE_VARIABLE)
+        return copy
     folder = expand_path(named_root, _ROOT_OPTION)
-    _check_folder_name(folder)
-    _refuse_file(folder)
-    return folder
-
-
-def _make_working_copy(url: str) -> Path:
-    folder = working_copy_of(url)
-    if url_of(folder) != url:
-        text = json.dumps({"url": url}, indent=1) + "\n"
-        write_atomically(folder / STORE_FILE, text.encode(), option=CACHE_VARIABLE)
-    return folder
-
-
-def _check_folder_name(folder: Path) -> None:
-    """Refuse a name that no file system can have; the folder may be missing."""
-    try:
-        folder.lstat()
-    except (OSError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno != errno.ENAMETOOLONG:
-            return
-        name = str(folder)
+    if any(os.path.isfile(place) for place in (folder, *folder.parents)):
         raise UsageError(
-            f"no folder can have that name: {name[:60]!a}..., {len(name)} characters; "
-            "name another folder",
+            f"the root {folder} is, or lies below, a file; name a folder",
             where=_ROOT_OPTION,
-        ) from error
-
-
-def _refuse_file(folder: Path) -> None:
-    """Refuse a root folder that is a file, or lies below one; it may be missing."""
-    for place in (folder, *folder.parents):
-        if os.path.isdir(place):
-            return
-        if os.path.exists(place):
-            raise UsageError(
-                f"the root is no folder: {place}, which is a file; name a folder; "
-                "without a root the folder for user data is taken",
-                where=_ROOT_OPTION,
-            )
+        )
+    return folder
 
 
 def root_url(root: str | Path | None) -> str | None:
@@ -451,52 +421,24 @@ def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> s
         is_closed = find_closed_folder(folder / MANIFEST_NAME) is not None
         if is_closed or any(folder.glob("*/*.nc")):
             sizes_with_data.append(size)
-    if len(sizes_with_data) == 1:
-        return sizes_with_data[0].name
-    if len(sizes) == 1 and not sizes_with_data:
+    names = [size.name for size in sizes_with_data]
+    if len(names) == 1:
+        return names[0]
+    if len(sizes) == 1:
         return sizes[0].name
-    has_mini = any(size.name == DEFAULT_NEW_SIZE for size in sizes_with_data)
-    if has_mini and is_chosen_of_several:
+    if DEFAULT_NEW_SIZE in names and is_chosen_of_several:
         return DEFAULT_NEW_SIZE
-    raise _size_error(
-        location, sizes, sizes_with_data, is_to_remove=not is_chosen_of_several
-    )
-
-
-def _size_error(
-    location: SplitLocation,
-    sizes: Sequence[Size],
-    sizes_with_data: Sequence[Size],
-    *,
-    is_to_remove: bool,
-) -> UsageError | DataError:
-    url = url_of(location.root)
-    size_names = ", ".join(size.name for size in sizes)
-    if sizes_with_data:
-        names_with_data = ", ".join(size.name for size in sizes_with_data)
-        return UsageError(
-            f"several sizes are there: name one: got {names_with_data} in "
-            f"{url or location.root}, expected {size_names}; --size "
-            f"{sizes_with_data[0].name}",
-            where="--size",
+    all_names = ", ".join(size.name for size in sizes)
+    if names:
+        raise UsageError(
+            f"several sizes are there: {', '.join(names)}; name one", where="--size"
         )
-
-    if is_to_remove:
-        what = "there is nothing to remove"
-        root_name = quote_root(location.root)
-        hint = f"lagbench list --root {root_name} shows what is there"
-    elif url is not None:
-        # The store may hold it: only what was fetched is known.
-        what = "no size is named, and none was fetched from the store"
-        hint = "name it with --size"
-    else:
-        what = "no size is named, and none is there"
-        size = location.registry.size(location.name, _size_to_make(location))
-        hint = suggest_repair(size, root=location.root)
-    return DataError(
-        f"{what}: got no data of {location.name} in {url or location.root}, expected "
-        f"{size_names}; {hint}",
-        where="--size",
+    size = registry.size(split, _size_to_make(location))
+    hint = suggest_repair(size, root=root)
+    if url_of(root) is not None or not is_chosen_of_several:
+        hint = f"name one: --size {DEFAULT_NEW_SIZE}"
+    raise DataError(
+        f"no size is named, and none of {all_names} is there; {hint}", where="--size"
     )
 
 
@@ -547,9 +489,28 @@ def check_contents(size: Size, root: Path, scenarios: Iterable[int]) -> None:
     for scenario in sorted(scenarios):
         path = size.path(root, scenario)
         subset = size.subset_of(scenario)
-        hint = _hint_for_damage(size, root, subset)
-        content = _content_hash(path, noted_hash, new_hashes, subset=subset, hint=hint)
-        expected = _expected_hash(size, scenario, manifest)
+        repair = suggest_repair(size, f"--subset {subset}", root=root)
+        verify = f"lagbench verify --split {size.split} --size {size.name}"
+        hint = f"{repair}; {verify} --root {quote_root(root)} says what is wrong"
+        try:
+            hashes = noted_hash(path)
+            if hashes is None:
+                new_hashes[path] = check_scenario(path)
+            content = hashes[0] if hashes else new_hashes[path]
+        except OSError as error:
+            raise DataError(
+                f"cannot read a {subset} scenario: {error.strerror}; {hint}",
+                where=str(path),
+            ) from error
+        except DataError as error:
+            raise DataError(
+                f"{error.text}; {hint}", where=error.where or str(path)
+            ) from error
+        # what is recorded: all of the hash, its first digits, or nothing
+        expected = size.registered_hash(scenario)
+        entry = manifest.entry(scenario) if manifest else None
+        if entry is not None:
+            expected = entry.content_sha256
         if not content.startswith(expected):
             raise DataError(
                 f"a {subset} scenario has another content hash: got {content}, "
@@ -557,44 +518,3 @@ def check_contents(size: Size, root: Path, scenarios: Iterable[int]) -> None:
                 where=str(path),
             )
     record_hashes(folder, new_hashes)
-
-
-def _content_hash(
-    path: Path,
-    noted_hash: Callable[[Path], tuple[str, str] | None],
-    new_hashes: dict[Path, str],
-    *,
-    subset: str,
-    hint: str,
-) -> str:
-    """Return the content hash of a file; one that was not noted is added."""
-    try:
-        hashes = noted_hash(path)
-        if hashes is not None:
-            return hashes[0]
-        new_hashes[path] = check_scenario(path)
-    except OSError as error:
-        raise DataError(
-            f"cannot read a {subset} scenario: {error.strerror}; {hint}",
-            where=str(path),
-        ) from error
-    except DataError as error:
-        raise DataError(
-            f"{error.text}; {hint}", where=error.where or str(path)
-        ) from error
-    return new_hashes[path]
-
-
-def _expected_hash(size: Size, scenario: int, manifest: Manifest | None) -> str:
-    """Return what is recorded of a content hash: all, its first digits, or nothing."""
-    if manifest is not None:
-        entry = manifest.entry(scenario)
-        if entry is not None:
-            return entry.content_sha256
-    return size.registered_hash(scenario)
-
-
-def _hint_for_damage(size: Size, root: Path, subset: str) -> str:
-    repair = suggest_repair(size, f"--subset {subset}", root=root)
-    verify = f"lagbench verify --split {size.split} --size {size.name}"
-    return f"{repair}; {verify} --root {quote_root(root)} says what is wrong"

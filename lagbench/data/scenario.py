@@ -246,8 +246,7 @@ class ScenarioFile:
         if shape:
             length = shape[0]
         # Any value takes at most 8 bytes.
-        entry_bytes = 8 * math.prod(shape[1:])
-        step = max(1, BLOCK_BYTES // max(1, entry_bytes))
+        step = max(1, BLOCK_BYTES // max(1, 8 * math.prod(shape[1:])))
         for start in range(0, length, step):
             yield self.read(name, slice(start, start + step))
 

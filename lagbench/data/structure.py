@@ -11,7 +11,6 @@ what the file holds.
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,6 @@ import numpy as np
 from lagbench.errors import UnreadableFileError
 
 from .hdf5 import (
-    DEFLATE_RATIO,
     INSIDE,
     MAX_LINKS,
     hdf5_errors,
@@ -50,9 +48,6 @@ MAX_ARRAY_RATIO = 200
 
 Particles at rest reach 100.
 """
-
-CHECKSUM_BYTES = 4
-"""Length of the checksum that the Fletcher-32 filter adds to a chunk [bytes]."""
 
 FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
 
@@ -161,7 +156,7 @@ def describe_array(dataset: h5py.Dataset, *, has_dims: bool = True) -> ArrayInfo
     # HDF5 opens the sources of a virtual data set to tell its shape.
     is_inside = layout in INSIDE
     shape = None
-    if is_inside and _has_simple_shape(dataset):
+    if is_inside and dataset.id.shape is not None:
         shape = tuple(dataset.id.shape)
 
     chunks = None
@@ -195,11 +190,6 @@ def describe_array(dataset: h5py.Dataset, *, has_dims: bool = True) -> ArrayInfo
         filters=tuple(filters),
         foreign_filters=tuple(foreign_filters),
     )
-
-
-def _has_simple_shape(dataset: h5py.Dataset) -> bool:
-    extent_type = dataset.id.get_space().get_simple_extent_type()
-    return extent_type in (h5py.h5s.SIMPLE, h5py.h5s.SCALAR)
 
 
 def _name_type(value_type: h5py.h5t.TypeID) -> str:
@@ -343,11 +333,9 @@ def check_structure(
 
     They have no names of dimensions.
 
-    Refused are links, members with several names, foreign storage and filters, filters
+    Refused are links, foreign storage and filters, filters
     that are applied twice, groups and types that the format does not have, and arrays
-    that unpack to far more than the file holds. The headers tell most of it. Large
-    chunks are unpacked up to the length that they declare: this check has to hold in a
-    process without limits.
+    that unpack to far more than the file holds, as the headers tell.
 
     Raises:
         UnreadableFileError: the file has another structure, is damaged, or is a trap.
@@ -358,11 +346,9 @@ def check_structure(
         for name in _list_arrays(file, path, expected):
             dataset = open_variable(file, name)
             array = describe_array(dataset, has_dims=False)
-            issue = (
-                find_storage_issue(array, length=length, cache=expected.cache)
-                or _find_type_issue(array, expected)
-                or _find_inflation(dataset, array)
-            )
+            issue = find_storage_issue(
+                array, length=length, cache=expected.cache
+            ) or _find_array_issue(array, expected)
             if issue is not None:
                 raise _refusal(path, name, issue)
             arrays[name] = array
@@ -380,6 +366,10 @@ def check_structure(
 
 def _list_arrays(file: h5py.File, path: Path, expected: Structure) -> list[str]:
     """Return the names of all arrays; refuse other members than the format has."""
+
+    def may_hold(group: str) -> bool:
+        return expected.groups is None or group in expected.groups
+
     arrays = []
     groups = [""]
     while groups:
@@ -393,98 +383,29 @@ def _list_arrays(file: h5py.File, path: Path, expected: Structure) -> list[str]:
             name = f"{group}{member}"
             if kind == "variable":
                 arrays.append(name)
-            elif kind == "group" and not group and _may_hold(expected, member):
+            elif kind == "group" and not group and may_hold(member):
                 groups.append(f"{member}/")
             else:
                 issue = StorageIssue("a member that is no variable", "a variable", kind)
                 raise _refusal(path, name, issue)
-            # a thousand names of one group of a thousand names: a small file, and a
-            # million arrays
-            name_count = h5py.h5o.get_info(file.id, name.encode()).rc
-            if name_count > 1:
-                names = f"{name_count} names"
-                issue = StorageIssue("a member has several names", "one name", names)
-                raise _refusal(path, name, issue)
     return arrays
 
 
-def _may_hold(expected: Structure, group: str) -> bool:
-    return expected.groups is None or group in expected.groups
-
-
-def _find_type_issue(array: ArrayInfo, expected: Structure) -> StorageIssue | None:
-    """Return an issue where an array of a file holds neither numbers nor texts.
-
-    Texts are allowed only where the format has them.
+def _find_array_issue(array: ArrayInfo, expected: Structure) -> StorageIssue | None:
+    """Return an issue where an array holds neither numbers nor, where the format has
+    them, texts, or would unpack to far more than its file holds.
     """
-    if expected.texts and array.kind in ("string", "variable-length"):
-        return None
-    if array.kind.startswith(("float", "int", "uint")):
-        return None
-    return StorageIssue("an array of another type", "plain numbers", array.kind)
-
-
-def _find_inflation(dataset: h5py.Dataset, array: ArrayInfo) -> StorageIssue | None:
-    """Return an issue where an array unpacks to more than its file can hold."""
     if array.unpacked > max(HARMLESS_BYTES, MAX_ARRAY_RATIO * array.packed):
         return StorageIssue(
             "the array would unpack to far more than the file holds",
             f"at most {MAX_ARRAY_RATIO} times {array.packed} bytes",
             f"{array.unpacked} bytes",
         )
-    if h5py.h5z.FILTER_DEFLATE not in array.filters:
+    if expected.texts and array.kind in ("string", "variable-length"):
         return None
-    for offset in _list_large_chunks(dataset, array):
-        if _exceeds_declared_length(dataset, array, offset):
-            return StorageIssue(
-                "a chunk unpacks to more than it declares",
-                f"{array.chunk_bytes} bytes",
-                "more",
-            )
-    return None
-
-
-def _list_large_chunks(
-    dataset: h5py.Dataset, array: ArrayInfo
-) -> list[tuple[int, ...]]:
-    """Return the offsets of chunks that may unpack to more than HARMLESS_BYTES."""
-    harmless_length = HARMLESS_BYTES // DEFLATE_RATIO
-    if array.largest_chunk <= harmless_length:
-        return []
-    offsets: list[tuple[int, ...]] = []
-
-    def note_large(chunk: h5py.h5d.StoreInfo) -> None:
-        if chunk.size > harmless_length:
-            offsets.append(chunk.chunk_offset)
-
-    dataset.id.chunk_iter(note_large)
-    return offsets
-
-
-def _exceeds_declared_length(
-    dataset: h5py.Dataset, array: ArrayInfo, offset: tuple[int, ...]
-) -> bool:
-    """Unpack a chunk to at most its declared length; tell whether there is more."""
-    # Bit i of the mask says that filter i was left out for this chunk.
-    mask, chunk = dataset.id.read_direct_chunk(offset)
-    applied_filters = []
-    for bit, code in enumerate(array.filters):
-        if not mask >> bit & 1:
-            applied_filters.append(code)
-    if h5py.h5z.FILTER_DEFLATE not in applied_filters:
-        return False
-    position = applied_filters.index(h5py.h5z.FILTER_DEFLATE)
-    later_filters = applied_filters[position + 1 :]
-    # No writer packs first and shuffles then.
-    if h5py.h5z.FILTER_SHUFFLE in later_filters:
-        return True
-
-    stream_length = len(chunk) - CHECKSUM_BYTES * len(later_filters)
-    stream = bytes(chunk)[:stream_length]
-    # A checksum may stand behind the values.
-    longest = array.chunk_bytes + CHECKSUM_BYTES
-    values = zlib.decompressobj().decompress(stream, longest + 1)
-    return len(values) > longest
+    if array.kind.startswith(("float", "int", "uint")):
+        return None
+    return StorageIssue("an array of another type", "plain numbers", array.kind)
 
 
 def _refusal(path: Path, name: str, issue: StorageIssue) -> UnreadableFileError:

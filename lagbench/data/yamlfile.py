@@ -1,9 +1,8 @@
 """Read YAML of strangers: safe types only, bounded size, no aliases.
 
 Aliases are refused because a few hundred bytes of them can expand to gigabytes;
-duplicate keys because the second would silently replace the first. Numbers are those of
-YAML 1.2: YAML 1.1, which PyYAML speaks, also has base 60 (``59:59:1.5``) and reads
-``010`` as eight.
+duplicate keys because the second would silently replace the first. Floats are those of
+YAML 1.2.
 """
 
 from __future__ import annotations
@@ -27,23 +26,12 @@ MAX_DEPTH = 32
 """Deepest nesting of mappings and lists that is read."""
 
 
-UNICODE_BREAKS = frozenset("\x85\u2028\u2029\ufeff")
-"""Characters that YAML takes for line breaks, and the mark of the order of bytes."""
-
-TEXT = "tag:yaml.org,2002:str"
-INTEGER = "tag:yaml.org,2002:int"
 FLOAT = "tag:yaml.org,2002:float"
-NUMBERS = {
-    INTEGER: re.compile(r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$"),
-    FLOAT: re.compile(
-        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
-        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-    ),
-}
-"""Numbers of YAML 1.2's core schema, by tag; integers are asked first."""
-
-FIRST_CHARACTERS = list("-+.0123456789")
-"""First characters of a number."""
+FLOATS = re.compile(
+    r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
+"""Floats of YAML 1.2: PyYAML takes 1e-3 for a text, and 59:59 for a number."""
 
 
 class _StrictLoader(yaml.CSafeLoader):
@@ -69,32 +57,16 @@ class _StrictLoader(yaml.CSafeLoader):
         return mapping
 
 
-def _construct_integer(_: _StrictLoader, node: yaml.ScalarNode) -> int:
-    if node.value.startswith(("0o", "0x")):
-        return int(node.value, base=0)
-    return int(node.value)
-
-
-def _construct_float(_: _StrictLoader, node: yaml.ScalarNode) -> float:
-    # YAML writes .inf and .nan, Python inf and nan.
-    if node.value[-1:].isalpha():
-        return float(node.value.replace(".", "", 1))
-    return float(node.value)
-
-
-def _register_number_types() -> None:
-    """Replace the numbers of YAML 1.1 by those of YAML 1.2."""
+def _use_floats(kind: type[yaml.CSafeLoader | yaml.SafeDumper]) -> None:
+    """Replace the floats of YAML 1.1 by those of YAML 1.2."""
     resolvers = {}
-    for first_character, pairs in yaml.CSafeLoader.yaml_implicit_resolvers.items():
-        resolvers[first_character] = [pair for pair in pairs if pair[0] not in NUMBERS]
-    _StrictLoader.yaml_implicit_resolvers = resolvers
-    for tag, pattern in NUMBERS.items():
-        _StrictLoader.add_implicit_resolver(tag, pattern, FIRST_CHARACTERS)
-    _StrictLoader.add_constructor(INTEGER, _construct_integer)
-    _StrictLoader.add_constructor(FLOAT, _construct_float)
+    for first_character, pairs in kind.yaml_implicit_resolvers.items():
+        resolvers[first_character] = [pair for pair in pairs if pair[0] != FLOAT]
+    kind.yaml_implicit_resolvers = resolvers
+    kind.add_implicit_resolver(FLOAT, FLOATS, list("-+.0123456789"))
 
 
-_register_number_types()
+_use_floats(_StrictLoader)
 
 
 def _check_structure(text: str) -> None:
@@ -144,26 +116,20 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
 
 
 class _Dumper(yaml.SafeDumper):
-    """Dumper for our reader.
-
-    It writes no aliases. Texts like numbers stand in quotes, and line breaks of Unicode
-    are escaped: readers fold them into blanks.
-    """
+    """Dumper for our reader; it writes no aliases."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
 
 
 def _represent_text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    style = None
-    if UNICODE_BREAKS.intersection(text):
-        style = '"'
-    return dumper.represent_scalar(TEXT, text, style=style)
+    # Readers fold line breaks of Unicode into blanks, unless they are escaped.
+    style = '"' if set("\x85\u2028\u2029\ufeff").intersection(text) else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 
 _Dumper.add_representer(str, _represent_text)
-for _tag, _pattern in NUMBERS.items():
-    _Dumper.add_implicit_resolver(_tag, _pattern, FIRST_CHARACTERS)
+_use_floats(_Dumper)
 
 
 def format_yaml(value: object, *, default_flow_style: bool | None = False) -> str:

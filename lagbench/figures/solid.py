@@ -52,8 +52,7 @@ class View:
         from_centre = self._corners - self._centre
         seen = from_centre @ _axes_of_view().T
         reach = np.abs(seen).max(axis=0)  # right, up, away [length]
-        largest = float(reach[:2].max())
-        self.scale = (0.5 - RIM) / largest
+        self.scale = (0.5 - RIM) / float(reach[:2].max())
         """Side lengths of the picture per length of the box."""
         self._reach = float(reach[2])
 
@@ -77,8 +76,7 @@ class View:
         """
         from_centre = np.asarray(position, np.float64) - self._centre
         away = from_centre @ _axes_of_view()[2]
-        depth = 0.5 + 0.5 * away / self._reach
-        return np.asarray(np.clip(depth, 0.0, 1.0))
+        return np.asarray(np.clip(0.5 + 0.5 * away / self._reach, 0.0, 1.0))
 
     def edges(self) -> Iterator[tuple[Floats, bool]]:
         """Yield the edges of the box, shape [end, 2], and whether each lies in front.
@@ -103,8 +101,7 @@ class View:
         axis, side = divmod(number, 2)
         coordinate = self._corners[:, axis]
         ends = np.unique(coordinate)  # ascending
-        is_on_wall = coordinate == ends[side]
-        corners = self._corners[is_on_wall]
+        corners = self._corners[coordinate == ends[side]]
         around = [0, 1, 3, 2]
         return self.place(corners[around])
 

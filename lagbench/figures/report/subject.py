@@ -113,8 +113,7 @@ class Subject:
         for row in rows:
             score = row.scores[metric.name]
             losses.append(metric.loss(score.mean))
-        finite_losses = np.nan_to_num(losses, nan=np.inf)
-        return rows[int(np.argmin(finite_losses))]
+        return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
 
     @property
     def data_name(self) -> str:
