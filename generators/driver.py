@@ -6,7 +6,7 @@ substep) inside a :class:`Driver`, which knows the bounds within which they are 
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import taichi as ti
@@ -337,7 +337,11 @@ class Driver(ABC, Generic[Parameters]):
 
 
 def check_program(
-    program: object, row: tuple[int, ...], *, where: str, has_one_row: bool = False
+    program: Any,
+    row: tuple[int, ...],
+    *,
+    where: str,
+    has_one_row: bool = False,  # noqa: ANN401
 ) -> None:
     """Refuse motions of walls, or forces, that a solver cannot take row by row.
 
@@ -350,14 +354,14 @@ def check_program(
     Raises:
         UsageError: it is no array of finite numbers, of another shape, or without rows.
     """
-    array = np.asarray(program)
-    is_row = has_one_row and array.shape == row
-    is_program = array.shape[1:] == row and len(array) > 0
-    is_numeric = array.dtype.kind in "fiu" and bool(np.isfinite(array).all())
-    if not is_numeric or not (is_row or is_program):
+    is_numeric = isinstance(program, np.ndarray) and program.dtype.kind in "fiu"
+    shape = np.shape(program) if is_numeric else ()
+    is_program = len(shape) == len(row) + 1 and shape[1:] == row and shape[0] > 0
+    has_rows = is_program or (has_one_row and shape == row)
+    if not is_numeric or not has_rows or not np.isfinite(program).all():
         raise UsageError(
-            f"a program of an initial state has shape {array.shape}, {array.dtype}; "
-            f"give finite numbers of shape [frame, {', '.join(map(str, row))}]",
+            "a program of an initial state is no array of finite numbers, shape "
+            f"[frame, {', '.join(map(str, row))}]; correct the initial state",
             where=where,
         )
 

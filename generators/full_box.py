@@ -194,11 +194,11 @@ class FullBox(Driver[FullBoxParameters]):
         if state.friction != 0.0:
             raise UsageError(
                 "a full box knows no friction; leave it out of the initial state",
-                where=where,
+                where=f"{where}, friction",
             )
 
         # Walls slide along themselves, and not faster than half a cell a substep.
-        walls = np.asarray(state.wall_velocity)
+        walls = state.wall_velocity
         shape = (2 * self.dimension, self.dimension)
         check_program(walls, shape, where=f"{where}, wall_velocity", has_one_row=True)
         bound = self._kernels.speed_bound
@@ -241,11 +241,13 @@ class FullBox(Driver[FullBoxParameters]):
         is_inside_box = True
         if obstacle is not None:
             count = len(obstacle.position)
+            shape = (count, self.dimension)
             reach = obstacle.radius + LEAST_GAP / self.parameters.grid
             centre = np.asarray(obstacle.centre)
             is_inside_box = (
                 obstacle.radius > 0.0
-                and centre.shape == np.shape(box.low)
+                and centre.shape == shape[1:]
+                and np.shape(obstacle.position) == shape
                 and bool((centre - reach >= box.low).all())
                 and bool((centre + reach <= box.high).all())
                 and bool(is_inside(obstacle.position, centre, obstacle.radius).all())

@@ -191,7 +191,7 @@ class FrameStore:
             texts["split"],
             texts["size"],
             major_of(texts["version"]),
-            np.asarray(file.attrs["scenario"]).tolist(),
+            *np.ravel(file.attrs["scenario"]).tolist(),
             len(position),
         )
         frames = size.frame_count(scenario)

@@ -8,7 +8,6 @@ import dataclasses
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -24,15 +23,11 @@ from box_scenarios import (
     scenario,
     snapshot,
 )
-from conftest import SIZE, SPLIT
 
-from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.generators.full_box import FullBox
 from lagbench.generators.solver import build
 from lagbench.generators.split import Device
-from lagbench.make.generate import GenerationResult
-from lagbench.make.verify import verify
 
 
 @pytest.mark.slow
@@ -276,30 +271,3 @@ def test_a_variable_of_taichi_that_is_no_number_is_named(name: str) -> None:
         env=os.environ | {name: "four"},
     )
     assert done.stdout == f"{name}\n"
-
-
-@pytest.mark.slow
-def test_simulating_anew_without_taichi_names_the_remedy(
-    generated: GenerationResult,
-    unmeasured: Registry,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A worker that finds no Taichi is a usage error with the extra to install, not a
-    crash.
-    """
-    (tmp_path / "taichi.py").write_text(
-        "raise ModuleNotFoundError('no taichi', name='taichi')\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(UsageError) as caught:
-        verify(
-            SPLIT,
-            SIZE,
-            root=generated.root,
-            regenerate=1,
-            workers=1,
-            registry=unmeasured,
-        )
-    assert caught.value.where == "this needs the extra 'generate'"
-    assert caught.value.fix == "pip install 'lagbench[generate]'"

@@ -161,19 +161,12 @@ def misplaced(**changes: object) -> InitialState:
 
 
 @pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"centre": (0.05, 0.25)}, "from all faces"),
-        ({"radius": 0.3}, "from all faces"),
-        ({"radius": 0.01}, "less than 0.01 from the centre"),
-    ],
+    "changes",
+    [{"centre": (0.05, 0.25)}, {"radius": 0.3}, {"radius": 0.01}],
 )
-def test_an_obstacle_lies_within_the_box(
-    changes: dict[str, object], expected: str
-) -> None:
-    with pytest.raises(UsageError) as caught:
+def test_an_obstacle_lies_within_the_box(changes: dict[str, object]) -> None:
+    with pytest.raises(UsageError):
         serial_solver().load([misplaced(**changes)])
-    assert expected in str(caught.value)
 
 
 def test_an_obstacle_has_a_radius_above_zero() -> None:
@@ -185,9 +178,8 @@ def test_an_obstacle_has_a_radius_above_zero() -> None:
     position[:, 0] = 1.1
     for radius in (-0.3, 0.0, np.nan):
         disc = misplaced(centre=centre, radius=radius, position=position)
-        with pytest.raises(UsageError) as caught:
+        with pytest.raises(UsageError):
             serial_solver().load([disc])
-        assert "radius" in str(caught.value)
 
 
 def test_an_obstacle_has_the_axes_of_the_box() -> None:
@@ -203,10 +195,8 @@ def test_an_obstacle_has_the_axes_of_the_box() -> None:
         {"position": position[:, :1]},
         {"position": position[:, 0]},
     ):
-        with pytest.raises(UsageError) as caught:
+        with pytest.raises(UsageError):
             serial_solver().load([misplaced(**changes)])
-        assert "obstacle" in str(caught.value.where)
-        assert "2 axes" in str(caught.value)
 
 
 def test_positions_of_an_obstacle_are_numbers() -> None:
@@ -214,6 +204,5 @@ def test_positions_of_an_obstacle_are_numbers() -> None:
     assert state.obstacle is not None
     position = state.obstacle.position.copy()
     position[0] = np.nan
-    with pytest.raises(UsageError) as caught:
+    with pytest.raises(UsageError):
         serial_solver().load([misplaced(position=position)])
-    assert "finite" in str(caught.value)

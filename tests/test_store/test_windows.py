@@ -638,12 +638,13 @@ def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) 
 
     def read_and_count(
         store: store_windows.FrameStore,
+        opened: store_windows.OpenScenario,
         scenario: int,
-        first: int,
-        last: int,
-    ) -> object:
-        frames_read.extend(range(first, last))
-        return read(store, scenario, first, last)
+        start: int,
+        stop: int,
+    ) -> None:
+        frames_read.extend(range(start, stop))
+        read(store, opened, scenario, start, stop)
 
     monkeypatch.setattr(store_windows.FrameStore, "_read", read_and_count)
     order = list(WindowSampler(data, seed=0))
