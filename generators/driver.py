@@ -341,7 +341,7 @@ def check_program(
     row: tuple[int, ...],
     *,
     where: str,
-    has_one_row: bool = False,  # noqa: ANN401
+    has_one_row: bool = False,
 ) -> None:
     """Refuse motions of walls, or forces, that a solver cannot take row by row.
 
@@ -355,7 +355,9 @@ def check_program(
         UsageError: it is no array of finite numbers, of another shape, or without rows.
     """
     is_numeric = isinstance(program, np.ndarray) and program.dtype.kind in "fiu"
-    shape = np.shape(program) if is_numeric else ()
+    shape: tuple[int, ...] = ()
+    if is_numeric:
+        shape = np.shape(program)
     is_program = len(shape) == len(row) + 1 and shape[1:] == row and shape[0] > 0
     has_rows = is_program or (has_one_row and shape == row)
     if not is_numeric or not has_rows or not np.isfinite(program).all():

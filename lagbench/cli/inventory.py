@@ -189,8 +189,8 @@ def info_command(
         for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
             sizes[shown_size.name] = _size_as_json(shown_size, size_overview)
         facts = ("version", "title", "description", "citation", "licence")
-        description = {fact: getattr(entry, fact) for fact in facts}
-        print_json({"split": name, **description, "sizes": sizes})
+        stated = {fact: getattr(entry, fact) for fact in facts}
+        print_json({"split": name, **stated, "sizes": sizes})
         return
 
     description = textwrap.fill(entry.description, TEXT_WIDTH, break_on_hyphens=False)

@@ -215,13 +215,13 @@ def reproduce_command(
                 root=root,
                 progress=progress,
             )
-        lines = []
+        blind_lines = []
         for one in scores:
-            lines.append(
+            blind_lines.append(
                 f"{one.name}: skill {one.public_skill:.3f} on test, "
                 f"{one.blind_skill:.3f} on the new scenarios"
             )
-        print_result(scores, lines, as_json=as_json, quiet=quiet)
+        print_result(scores, blind_lines, as_json=as_json, quiet=quiet)
         return 0
     folder = find_board(board)
 

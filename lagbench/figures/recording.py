@@ -189,7 +189,7 @@ class Recording:
         value = self.parameters.get("reynolds_number")
         if value is None:
             return None
-        return float(value)
+        return float(str(value))
 
     @property
     def is_mixed(self) -> bool:

@@ -213,6 +213,8 @@ def generate(
         ):
             campaign.store = store
             campaign.manifest = read_or_empty(tier, data_root)
+            if store is not None:
+                campaign.manifest = store.join(campaign.manifest)
             remove_leftovers(campaign.folder)
             for source in sources:
                 joint = gather_files(tier, data_root, source, campaign.manifest)

@@ -308,7 +308,8 @@ class Publication:
         self._root = root
         self._objects = Objects(url, store_folder(size))
         # right entries of the store whose objects are there, by id
-        self.stored_entries = self._read_entries(self._read_manifest())
+        self._manifest = self._read_manifest()
+        self.stored_entries = self._read_entries(self._manifest)
 
     def _read_manifest(self) -> Manifest:
         """Return the store's manifest; an empty one where none can be read."""
@@ -325,6 +326,13 @@ class Publication:
             if is_whole and matches_registry(entry, self._size, manifest):
                 entries[entry.scenario] = entry
         return entries
+
+    def join(self, local: Manifest) -> Manifest:
+        """Return the store's manifest with what only the working copy has."""
+        files = tuple(self.stored_entries.values())
+        stored = self._manifest.model_copy(update={"files": files})
+        own = [e for e in local.files if e.scenario not in self.stored_entries]
+        return merge_entries(self._size, stored, own)
 
     def has_card(self) -> bool:
         """Return whether the store has a card of the data set."""
