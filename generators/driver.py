@@ -6,7 +6,7 @@ substep) inside a :class:`Driver`, which knows the bounds within which they are 
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import taichi as ti
@@ -337,7 +337,7 @@ class Driver(ABC, Generic[Parameters]):
 
 
 def check_program(
-    program: Any,
+    program: object,
     row: tuple[int, ...],
     *,
     where: str,
@@ -354,13 +354,11 @@ def check_program(
     Raises:
         UsageError: it is no array of finite numbers, of another shape, or without rows.
     """
-    is_numeric = isinstance(program, np.ndarray) and program.dtype.kind in "fiu"
-    shape: tuple[int, ...] = ()
-    if is_numeric:
-        shape = np.shape(program)
-    is_program = len(shape) == len(row) + 1 and shape[1:] == row and shape[0] > 0
-    has_rows = is_program or (has_one_row and shape == row)
-    if not is_numeric or not has_rows or not np.isfinite(program).all():
+    array = program if isinstance(program, np.ndarray) else np.empty((), object)
+    is_numeric = array.dtype.kind in "fiu" and bool(np.isfinite(array).all())
+    is_row = has_one_row and array.shape == row
+    is_program = array.ndim > 0 and len(array) > 0 and array.shape[1:] == row
+    if not is_numeric or not (is_row or is_program):
         raise UsageError(
             "a program of an initial state is no array of finite numbers, shape "
             f"[frame, {', '.join(map(str, row))}]; correct the initial state",
