@@ -40,7 +40,7 @@ OPEN_FILES = 128
 """Files that a store keeps open, about 0.6 MB each; our splits train on up to 63."""
 
 
-class OpenScenario(NamedTuple):
+class ScenarioHandle(NamedTuple):
     """An open file, with what all its windows share."""
 
     file: h5py.File
@@ -79,7 +79,7 @@ class FrameStore:
     def _reset(self) -> None:
         self._process = os.getpid()
         # least recently used first
-        self._open_scenarios: OrderedDict[int, OpenScenario] = OrderedDict()
+        self._open_scenarios: OrderedDict[int, ScenarioHandle] = OrderedDict()
         self._cached_frames: OrderedDict[tuple[int, int], Floats] = OrderedDict()
         self.cached_bytes = 0
 
@@ -116,7 +116,9 @@ class FrameStore:
             self.cached_bytes -= oldest.nbytes
         return frames
 
-    def _read(self, opened: OpenScenario, scenario: int, start: int, stop: int) -> None:
+    def _read(
+        self, opened: ScenarioHandle, scenario: int, start: int, stop: int
+    ) -> None:
         """Put consecutive frames into the cache."""
         for frame, positions in enumerate(opened.position[start:stop], start=start):
             if (scenario, frame) not in self._cached_frames:
@@ -124,7 +126,7 @@ class FrameStore:
                 self._cached_frames[scenario, frame] = positions.copy()
                 self.cached_bytes += positions.nbytes
 
-    def open(self, scenario: int) -> OpenScenario:
+    def open(self, scenario: int) -> ScenarioHandle:
         """Return an open file; of too many the least recently used is closed."""
         if os.getpid() != self._process:
             self._reset()  # HDF5 handles do not survive a fork
@@ -137,7 +139,7 @@ class FrameStore:
         self._open_scenarios.move_to_end(scenario)
         return self._open_scenarios[scenario]
 
-    def _open_checked(self, scenario: int) -> OpenScenario:
+    def _open_checked(self, scenario: int) -> ScenarioHandle:
         """Open a file; refuse one of another scenario, version or content."""
         path = self._paths[scenario]
         if not has_file(path):
@@ -161,7 +163,7 @@ class FrameStore:
             arrays["material"] = np.zeros(position.shape[1], np.int8)
         parameters = select_parameters(file.attrs, where=str(path))
         stated = parse_viscosity(parameters.get("viscosity"), where=str(path))
-        return OpenScenario(
+        return ScenarioHandle(
             file,
             position,
             **arrays,

@@ -638,7 +638,7 @@ def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) 
 
     def read_and_count(
         store: store_windows.FrameStore,
-        opened: store_windows.OpenScenario,
+        opened: store_windows.ScenarioHandle,
         scenario: int,
         start: int,
         stop: int,
