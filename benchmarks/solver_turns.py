@@ -1,8 +1,9 @@
-"""The kernels of this tree against those of another commit, in short turns.
+"""The kernels of this tree against those of another commit or engine, in short turns.
 
     python benchmarks/solver_turns.py --against main~20 --cases cavity curl-noise-3d
+    python benchmarks/solver_turns.py --against quadrants
 
-Per case two processes, one of each commit, keep their solvers and advance one scenario
+Per case two processes, one of each side, keep their solvers and advance one scenario
 from its start, in turns, on the same core. So both meet the same load of the machine.
 The scenario is the first one of test, or the one that ``--scenario`` names.
 
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from lagbench.data.registry import load
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.solver import build
+from lagbench.work.engine import ENGINE_VARIABLE, ENGINES
 
 CASES = ("cavity", "curl-noise", "fluid", "multimaterial")
 PARTICLE_SUBSTEPS = 2_000_000  # of a turn
@@ -71,10 +73,16 @@ def serve(split: str, size: str, scenario: int | None) -> None:
 
 
 class Side:
-    """The process of one commit."""
+    """The process of one commit and engine."""
 
     def __init__(
-        self, tree: Path, split: str, size: str, *, scenario: int | None
+        self,
+        tree: Path,
+        split: str,
+        size: str,
+        *,
+        scenario: int | None,
+        engine: str,
     ) -> None:
         core = min(os.sched_getaffinity(0))
         command = [sys.executable, __file__, "--serve", split, "--size", size]
@@ -84,7 +92,7 @@ class Side:
         self._process = subprocess.Popen(
             command,
             cwd=tree,
-            env={**os.environ, "PYTHONPATH": str(tree)},
+            env={**os.environ, "PYTHONPATH": str(tree), ENGINE_VARIABLE: engine},
             preexec_fn=lambda: os.sched_setaffinity(0, {core}),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -106,10 +114,19 @@ class Side:
 
 
 def compare(
-    other: Path, split: str, size: str, *, scenario: int | None, turns: int
+    other: Path,
+    split: str,
+    size: str,
+    *,
+    scenario: int | None,
+    turns: int,
+    engine: str,
 ) -> NDArray[np.float64]:
-    """Return the rates of both trees, shape [turn, tree]."""
-    sides = [Side(tree, split, size, scenario=scenario) for tree in (other, HERE)]
+    """Return the rates of both sides, shape [turn, side]; the other's engine first."""
+    sides = [
+        Side(other, split, size, scenario=scenario, engine=engine),
+        Side(HERE, split, size, scenario=scenario, engine=ENGINES[0]),
+    ]
     rates = np.empty((turns, 2))
     for turn in range(turns):
         for index, side in enumerate(sides):
@@ -120,11 +137,11 @@ def compare(
 
 
 def main() -> int:
-    """Compare the two commits case by case and print a table."""
+    """Compare the two sides case by case and print a table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--against", metavar="REV")
+    parser.add_argument("--against", metavar="REV|ENGINE")
     parser.add_argument("--cases", nargs="+", default=CASES, metavar="SPLIT")
     parser.add_argument("--size", default="mini")
     parser.add_argument(
@@ -151,7 +168,13 @@ def main() -> int:
     )
     print(f"| case | {options.against} | this tree | ratio | quartiles |")
     print("|---|---:|---:|---:|---|")
-    with checked_out(options.against) as other:
+    engine = ENGINES[0]
+    tree: AbstractContextManager[Path] = nullcontext(HERE)
+    if options.against in ENGINES:
+        engine = options.against
+    else:
+        tree = checked_out(options.against)
+    with tree as other:
         for case in options.cases:
             rates = compare(
                 other,
@@ -159,6 +182,7 @@ def main() -> int:
                 options.size,
                 scenario=options.scenario,
                 turns=options.turns,
+                engine=engine,
             )
             theirs, ours = np.median(rates, axis=0) / 1e6
             their_rates, our_rates = rates.T

@@ -1,4 +1,4 @@
-"""Taichi's runtime: started once per process, with strict arithmetic.
+"""The engine's runtime: started once per process, with strict arithmetic.
 
 Strict means: no fused multiply-add, no reassociation (``fast_math=False``), float32 and
 int32 wherever a kernel does not say otherwise. Everything that makes fields starts
@@ -19,58 +19,52 @@ from lagbench.errors import (
     LagbenchError,
     UsageError,
     WorkFailedError,
-    require,
 )
 from lagbench.work.machine import available_cores
 
+from .language import ENGINE, ti
 from .split import Device
 
-# As it is imported, Taichi greets on stdout, which would spoil `--json`, and asks the
-# network for a newer version.
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
-ti = require("taichi", extra="generate")
+PREFIX = {"taichi": "TI_", "quadrants": "QD_"}[ENGINE]
+"""What the names of the engine's environment variables begin with."""
+
+MEMORY_VARIABLES = (f"{PREFIX}DEVICE_MEMORY_FRACTION", f"{PREFIX}DEVICE_MEMORY_GB")
+"""Variables of the engine that are numbers."""
 
 HARMLESS = frozenset(
     {
-        "TI_DEVICE_MEMORY_FRACTION",
-        "TI_DEVICE_MEMORY_GB",
-        "TI_ENABLE_CUDA",
-        "TI_LIB_DIR",
-        "TI_OFFLINE_CACHE_FILE_PATH",
+        *MEMORY_VARIABLES,
+        f"{PREFIX}ENABLE_CUDA",
+        f"{PREFIX}LIB_DIR",
+        f"{PREFIX}OFFLINE_CACHE_FILE_PATH",
         "TI_SKIP_VERSION_CHECK",
-        "TI_VISIBLE_DEVICE",
+        f"{PREFIX}VISIBLE_DEVICE",
     }
 )
-"""Variables of Taichi that a user may set: they choose memory, places and cards,
+"""Variables of the engine that a user may set: they choose memory, places and cards,
 never arithmetic.
 """
-
-MEMORY_VARIABLES = ("TI_DEVICE_MEMORY_FRACTION", "TI_DEVICE_MEMORY_GB")
-"""Variables of Taichi that are numbers."""
 
 PROCESS_WORDS = os.strerror(errno.EAGAIN)
 """What the system says that starts no more threads."""
 
 MEMORY_WORDS = "memory allocation"
-"""What Taichi says that finds no memory as it starts."""
+"""What an engine says that finds no memory as it starts."""
 
 _started: list[tuple[bool, int]] = []
 
 
 def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> int:
-    """Start Taichi for a device unless it runs, and return the threads for parallel
+    """Start the engine for a device unless it runs, and return the threads for parallel
     loops.
 
     The first call in a process fixes the size of the thread pool; idle threads sleep.
     """
     if device is Device.CPU and scenarios != 1:
         raise UsageError(
-            "the serial device advances one scenario at a time",
+            f"the serial device advances one scenario at a time, not {scenarios}; use "
+            f"one worker per scenario, or device {Device.PARALLEL.value}",
             where=f"device {device.value}",
-            expected="scenarios = 1",
-            got=scenarios,
-            fix=f"use one worker per scenario, or device {Device.PARALLEL.value}",
         )
     on_gpu = device is Device.CUDA
     if not _started:
@@ -82,17 +76,15 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
     if running_on_gpu != on_gpu or (threads or 1) > pool_size:
         running_device = "CUDA" if running_on_gpu else "CPU"
         raise UsageError(
-            "Taichi runs already with another device or fewer threads",
-            where="Taichi in this process",
-            expected=f"{running_device} with at most {pool_size} threads",
-            got=f"{device.value}, threads: {threads or 1}",
-            fix="use another process",
+            f"{ENGINE} runs already on the {running_device} with at most {pool_size} "
+            f"threads; use another process for {threads or 1} of {device.value}",
+            where=f"device {device.value}",
         )
     return threads or min(pool_size, available_cores())
 
 
 def _initialise(on_gpu: bool, pool_size: int) -> None:
-    """Start Taichi in silence and with strict arithmetic."""
+    """Start the engine in silence and with strict arithmetic."""
     for name in MEMORY_VARIABLES:
         _check_number(name)
     architecture = ti.cuda if on_gpu else ti.cpu
@@ -122,11 +114,7 @@ def _check_number(name: str) -> None:
         float(value)
     except ValueError as error:
         raise UsageError(
-            "an environment variable of Taichi is no number",
-            where=name,
-            expected="a number, such as 0.5",
-            got=ascii(value),
-            fix=f"unset {name}, or set it to a number",
+            f"no number: {value!a}; unset it, or set it to one such as 0.5", where=name
         ) from error
 
 
@@ -135,7 +123,7 @@ def _hidden_variables() -> Iterator[None]:
     """Hide variables that would change device, precision or optimisation unseen."""
     names = []
     for name in os.environ:
-        if name.startswith("TI_") and name not in HARMLESS:
+        if name.startswith(PREFIX) and name not in HARMLESS:
             names.append(name)
     hidden = {name: os.environ.pop(name) for name in names}
     try:
@@ -145,40 +133,25 @@ def _hidden_variables() -> Iterator[None]:
 
 
 def _device_error(on_gpu: bool, error: RuntimeError) -> LagbenchError:
-    if MEMORY_WORDS in str(error):
+    text = str(error)
+    if MEMORY_WORDS in text:
         return WorkFailedError(
-            "there is not enough memory",
-            where="Taichi",
-            expected="room for a gigabyte of addresses",
-            got=error,
-            fix="raise the limit (`ulimit -v unlimited`, or that of the batch system)",
+            f"there is no gigabyte of addresses ({text}); raise the limit (`ulimit -v "
+            "unlimited`, or that of the batch system)",
+            where=ENGINE,
         )
-    if PROCESS_WORDS in str(error):
+    if PROCESS_WORDS in text:
         return WorkFailedError(
-            "a limit of the operating system is reached",
-            where="Taichi",
-            expected="room for the threads of Taichi",
-            got=error,
-            fix=LIMIT_FIXES[errno.EAGAIN],
+            f"no room for threads ({text}); {LIMIT_FIXES[errno.EAGAIN]}", where=ENGINE
         )
+    fix = "`lagbench doctor` shows this machine; `lagbench download` needs no engine"
     if on_gpu:
-        return UsageError(
-            "Taichi cannot use this device",
-            where="cuda",
-            expected="an NVIDIA GPU with its driver",
-            got=error,
-            fix="use --device cpu: there is no NVIDIA GPU, or no driver of one",
-        )
-    return UsageError(
-        "Taichi cannot use this device",
-        where="cpu",
-        expected="a processor that Taichi can use",
-        got=error,
-        fix="`lagbench doctor` shows this machine; `lagbench download` needs no Taichi",
-    )
+        fix = "use --device cpu: there is no NVIDIA GPU, or no driver of one"
+    device = "cuda" if on_gpu else "cpu"
+    return UsageError(f"{ENGINE} cannot use this device ({text}); {fix}", where=device)
 
 
-def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)
+def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (an engine is untyped)
     """Give fields of the shape of their group memory, each an array of its own."""
     axes_by_dimension = (ti.i, ti.ij, ti.ijk, ti.ijkl)
     builder = ti.FieldsBuilder()

@@ -17,10 +17,7 @@ eigenvector.
 Sources: Hu et al. 2018 (MLS-MPM), Stomakhin et al. 2012 (fixed corotated), 2013 (snow).
 """
 
-import taichi as ti
-from taichi import f32
-from taichi.math import mat2, vec3
-
+from .language import f32, mat2, ti, vec3
 from .transfer import Value, bounded
 
 # largest magnitude for which the error bound of :func:`exponential` holds

@@ -31,11 +31,8 @@ Sources: Markley 1993 (the quartic), Hoger and Carlson 1984 (the square root), G
 Van Loan (Jacobi's method), Stomakhin et al. 2012, 2013.
 """
 
-import taichi as ti
-from taichi import f32
-from taichi.math import mat3
-
 from .constitutive import STRETCH_MIN, larger
+from .language import f32, mat3, ti
 from .transfer import Template, Value, bounded
 
 # Newton steps: relative error of V within 2e-6 for stretches from 0.3 to 2.5

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-import taichi as ti
 
 from lagbench.errors import UsageError, WorkFailedError
 
 from . import backend
 from .full_box_parameters import FullBoxParameters
+from .language import ti
 from .solver import Health, Singles
 from .split import (
     Device,

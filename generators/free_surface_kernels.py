@@ -7,13 +7,11 @@ in :mod:`.particle_stress` and :mod:`.particle_stress_3d`.
 from typing import ClassVar
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
-from taichi import f32, i32
-from taichi.math import vec4
 
 from . import backend
 from .constitutive import lame, larger
+from .language import f32, i32, ti, vec4
 from .split import FreeSurfaceParameters, Material
 from .transfer import Value, bounded, fixed_point_scale
 

@@ -42,14 +42,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
-from taichi import f32, i32, i64
-from taichi.math import vec3, vec4
 
 from . import backend
 from .box_tables import LANES, BoxTables, Singles
 from .full_box_parameters import FullBoxParameters
+from .language import f32, i32, i64, ti, vec3, vec4
 from .obstacle import Obstacle, is_inside
 from .transfer import (
     Nothing,

@@ -23,10 +23,6 @@ Source: Hu et al. 2018; Jiang et al. 2015 (APIC). The tie of J to the density is
 without it a settled liquid loses a fifth of its depth.
 """
 
-import taichi as ti
-from taichi import f32, i32, i64
-from taichi.math import mat2, vec2, vec4
-
 from .constitutive import (
     corotated_stress,
     determinant,
@@ -38,6 +34,7 @@ from .constitutive import (
     viscous_stress,
 )
 from .free_surface_kernels import LIQUID, ROPE, SNOW, FreeSurfaceKernels, largest_of
+from .language import f32, i32, i64, mat2, ti, vec2, vec4
 from .transfer import (
     Nothing,
     Template,

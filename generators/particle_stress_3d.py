@@ -16,10 +16,7 @@ import math
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
-from taichi import f32, i32, i64
-from taichi.math import mat3, vec3, vec4
 
 from . import backend
 from .constitutive import hardening, larger, liquid_stress
@@ -31,6 +28,7 @@ from .constitutive_3d import (
     rows_of,
 )
 from .free_surface_kernels import LIQUID, ROPE, SNOW, FreeSurfaceKernels, finite
+from .language import f32, i32, i64, mat3, ti, vec3, vec4
 from .transfer import (
     Nothing,
     Template,

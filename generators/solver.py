@@ -104,8 +104,6 @@ def build(
     """
     module_name, class_name = IMPLEMENTATIONS[type(parameters)]
     package = __name__.rpartition(".")[0]
-    # before Taichi itself, which it keeps quiet
-    importlib.import_module(".backend", package)
     module = importlib.import_module(module_name, package)
     solver_class = getattr(module, class_name)
     solver = solver_class(

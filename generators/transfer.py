@@ -23,9 +23,7 @@ import inspect
 import math
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import taichi as ti
-from taichi import f32, f64, i32, i64
-from taichi.math import vec2, vec3, vec4
+from .language import f32, f64, i32, i64, ti, vec2, vec3, vec4
 
 if TYPE_CHECKING:
     Template: TypeAlias = Any

@@ -39,6 +39,7 @@ from lagbench.scoring import score as scorer
 from lagbench.scoring.score import ScenarioScores
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission.format import FileInfo
+from lagbench.work.engine import ENGINES
 from lagbench.work.run import Meter
 
 if TYPE_CHECKING:
@@ -119,15 +120,16 @@ def shorten_compilation() -> None:
 
 
 def pytest_sessionfinish() -> None:
-    """Have Taichi keep the kernels that it compiled.
+    """Have the engine keep the kernels that it compiled.
 
     It keeps them only where no solver is left as the process ends.
     """
-    taichi = sys.modules.get("taichi")
-    if taichi is not None:
-        # A cache that cannot be written costs the next run a compilation.
-        with suppress(Exception):
-            taichi.reset()
+    for name in ENGINES:
+        engine = sys.modules.get(name)
+        if engine is not None:
+            # A cache that cannot be written costs the next run a compilation.
+            with suppress(Exception):
+                engine.reset()
     if sys.pycache_prefix is not None:
         # The bytecode of modules in temporary folders is never read again.
         temporary_modules = sys.pycache_prefix + tempfile.gettempdir()

@@ -69,9 +69,10 @@ PRODUCT_FOLDERS = (
 LONGEST_CHAIN = 15
 """Modules in the longest chain of imports, at most."""
 
-DRAWN = {"matplotlib", "PIL", "xarray", "taichi", "torch"}
+DRAWN = {"matplotlib", "PIL", "xarray", "taichi", "quadrants", "torch"}
 HEAVY = {
     "taichi",
+    "quadrants",
     "torch",
     "matplotlib",
     "xarray",

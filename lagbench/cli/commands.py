@@ -174,6 +174,13 @@ COMMANDS = (
         "animate fluid --size tiny --scenario 3 -o splash.gif",
     ),
     Command(
+        "Pictures",
+        "view",
+        "pictures:view_command",
+        "Show a scenario, and a prediction beside it, in Rerun's viewer.",
+        "view fluid predictions.nc --size tiny",
+    ),
+    Command(
         "Leaderboard",
         "submit",
         "submit:submit_command",

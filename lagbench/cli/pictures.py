@@ -1,4 +1,4 @@
-"""The commands plot and animate."""
+"""The commands plot, animate and view."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from cyclopts.types import PositiveInt
 
 from lagbench.data.local import locate
 from lagbench.errors import UsageError
+from lagbench.exchange.viewing import view
 from lagbench.figures.pictures import (
     animate,
     data_name,
@@ -128,3 +129,33 @@ def animate_command(
         quiet=quiet or as_json,
     )
     print_result({"output": path}, [str(path)], as_json=as_json, quiet=quiet)
+
+
+def view_command(
+    split: str,
+    predictions: Path | None = None,
+    *,
+    size: PresentSizeOption = None,
+    scenario: int | None = None,
+    every: PositiveInt = 1,
+    output: OutputOption = None,
+    overwrite: OverwriteFlag = False,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Show a scenario, and a prediction beside it, in Rerun's viewer.
+
+    Args:
+        split: A split, or a scenario file.
+        predictions: A predictions.nc of this data set, shown beside the truth.
+        scenario: Scenario; by default the first one of test.
+        every: Show every n-th frame.
+        output: File (.rrd) to write, in place of starting the viewer.
+    """
+    file = find_scenario(split, size=size, scenario=scenario, root=root)
+    if output is not None:
+        require_place(output, overwrite=overwrite)
+    view(file, predictions=predictions, output=output, every=every)
+    lines = [] if output is None else [str(output)]
+    print_result({"output": output}, lines, as_json=as_json, quiet=quiet)

@@ -6,10 +6,11 @@ import time
 from dataclasses import dataclass
 
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, check_installed
+from lagbench.errors import LagbenchError
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.solver import build
+from lagbench.work.engine import find_engine
 from lagbench.work.executor import Report, WorkItem, run_items
 
 from .output import print_warning
@@ -35,7 +36,7 @@ class SolverBench:
 def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     """Simulate the first test scenario and time its frames.
 
-    Taichi starts once per process: call this from a process of its own, as
+    The engine starts once per process: call this from a process of its own, as
     :func:`bench_in_own_process` does.
 
     Args:
@@ -44,7 +45,7 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
         frames: least number of frames to time; more if they take under half a second.
     """
     tier = load().size(split, size)
-    check_installed("taichi", extra="generate")
+    find_engine()
     solver = build(solver_constants(tier))
     first_scenario = tier.subsets["test"][0]
     solver.load([draw_initial_state(tier, first_scenario)])
@@ -74,7 +75,7 @@ def bench_in_own_process(split: str, size: str) -> SolverBench:
     The memory and the threads of this process do not disturb it there.
     """
     load().size(split, size)
-    check_installed("taichi", extra="generate")
+    find_engine()
     item = WorkItem(
         name=f"bench of {split} {size}", function=_bench, argument=(split, size)
     )

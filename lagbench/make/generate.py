@@ -39,7 +39,6 @@ from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import (
     UsageError,
     WorkFailedError,
-    check_installed,
     suggest_name,
 )
 from lagbench.generators.batch import (
@@ -52,6 +51,7 @@ from lagbench.generators.split import Device
 from lagbench.store.copy import Publication, publish
 from lagbench.store.copy import gather as gather_files
 from lagbench.store.objects import Objects
+from lagbench.work.engine import find_engine
 from lagbench.work.executor import (
     ONE_THREAD,
     Finished,
@@ -156,7 +156,7 @@ def generate(
 
     Raises:
         UsageError: unknown split, size, subset, scenario or device, fewer than one
-            worker, or Taichi is not installed; or nothing can be gathered from a
+            worker, or no engine is installed; or nothing can be gathered from a
             folder.
         WorkFailedError: disk full or not writable, a scenario cannot be drawn or blew
             up, workers keep dying, the cluster is lost or does not see the root folder;
@@ -206,7 +206,7 @@ def generate(
         verdict = ""
     else:
         if scheduler is None:
-            check_installed("taichi", extra="generate")
+            find_engine()
         with (
             dataset_lock(data_root, tier.split, tier.name, tier.major, on_wait=on_wait),
             nullcontext() if url is None else publish(tier, data_root, url) as store,

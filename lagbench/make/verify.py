@@ -25,11 +25,12 @@ from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UsageError, check_installed
+from lagbench.errors import DataError, UsageError
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.split import Device
 from lagbench.store.copy import update_working_copy
+from lagbench.work.engine import find_engine
 from lagbench.work.executor import WorkItem, run_items
 from lagbench.work.machine import worker_count
 from lagbench.work.run import Meter, Progress
@@ -158,7 +159,7 @@ def verify(
             where="--regenerate",
         )
     if regenerate:
-        check_installed("taichi", extra="generate")
+        find_engine()
 
     update_working_copy(tier, data_root, ids, thoroughly=True)
     manifest = None

@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
-from lagbench.errors import check_installed
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.split import InitialState
+from lagbench.work.engine import find_engine
 
 from .predictor import (
     Floats,
@@ -113,8 +113,8 @@ class CoarseRollout:
     """
 
     def __init__(self, given: Given, coarse: Size) -> None:
-        # Not imported here: the solver keeps Taichi quiet.
-        check_installed("taichi", extra="generate")
+        # Not imported here: the solver keeps its engine quiet.
+        find_engine()
 
         self.given = given
         self.substeps = coarse.substeps_per_frame

@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import Box
 from lagbench.data.registry import Size
-from lagbench.errors import check_installed
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.draws import quantise
 from lagbench.generators.obstacle import Obstacle
@@ -45,6 +44,7 @@ from lagbench.generators.split import (
     InitialState,
     SolverParameters,
 )
+from lagbench.work.engine import find_engine
 
 from .predictor import (
     Floats,
@@ -165,8 +165,8 @@ class Restart(ABC):
     """
 
     def __init__(self, given: Given, resolution: Resolution) -> None:
-        # Not imported here: the solver keeps Taichi quiet.
-        check_installed("taichi", extra="generate")
+        # Not imported here: the solver keeps its engine quiet.
+        find_engine()
 
         self.given = given
         self.resolution = resolution

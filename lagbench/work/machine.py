@@ -12,14 +12,17 @@ import importlib.util
 import os
 import platform
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
-from lagbench.errors import UsageError
+from lagbench.errors import NotInstalledError, UsageError
+
+from .engine import find_engine
 
 _MACHINES = {"x86_64", "amd64"}
 _DEVICES = {"cpu", "parallel"}
-_LIBRARIES = ("lagbench", "numpy", "netCDF4", "taichi")
+_LIBRARIES = ("lagbench", "numpy", "netCDF4")
 
 
 def describe_machine(device: str) -> dict[str, str]:
@@ -29,9 +32,11 @@ def describe_machine(device: str) -> dict[str, str]:
         "machine": platform.machine(),
         "system": platform.system(),
     }
-    for library in _LIBRARIES:
-        if importlib.util.find_spec(library):
-            environment[library] = version(library)
+    libraries = [name for name in _LIBRARIES if importlib.util.find_spec(name)]
+    with suppress(NotInstalledError):
+        libraries.append(find_engine())
+    for library in libraries:
+        environment[library] = version(library)
     environment["device"] = device
     return environment
 

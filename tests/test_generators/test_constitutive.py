@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
-import taichi as ti
 from constitutive_truth import (
     HIGH,
     LAMBDA,
@@ -23,6 +22,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import polar
 
 from lagbench.generators import backend, constitutive
+from lagbench.generators.language import ti
 from lagbench.generators.split import Device
 from lagbench.generators.transfer import Nothing
 
@@ -35,8 +35,8 @@ COUNT = 4096
 
 
 @pytest.fixture(autouse=True)
-def taichi_runtime() -> None:
-    """Start Taichi as the solver does: strict float32 on the CPU."""
+def engine() -> None:
+    """Start the engine as the solver does: strict float32 on the CPU."""
     backend.start(Device.CPU)
 
 

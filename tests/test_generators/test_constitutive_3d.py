@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
-import taichi as ti
 from constitutive_truth import (
     HIGH,
     LAMBDA,
@@ -24,6 +23,7 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from lagbench.generators import backend, constitutive_3d
+from lagbench.generators.language import ti
 from lagbench.generators.split import Device
 from lagbench.generators.transfer import Nothing
 
@@ -39,8 +39,8 @@ ENTRY = ((0, 5, 4), (5, 1, 3), (4, 3, 2))
 
 
 @pytest.fixture(autouse=True)
-def taichi_runtime() -> None:
-    """Start Taichi as the solver does: strict float32 on the CPU."""
+def engine() -> None:
+    """Start the engine as the solver does: strict float32 on the CPU."""
     backend.start(Device.CPU)
 
 

@@ -4,13 +4,13 @@ sums.
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
 from lagbench.generators import backend, transfer
+from lagbench.generators.language import ti
 from lagbench.generators.split import Device
 
 DX = 1.0 / 32.0
@@ -69,8 +69,8 @@ def count_weights(  # type: ignore[no-untyped-def] # noqa: ANN201
 
 
 @pytest.fixture(autouse=True)
-def taichi_runtime() -> None:
-    """Start Taichi as the solver does."""
+def engine() -> None:
+    """Start the engine as the solver does."""
     backend.start(Device.CPU)
 
 

@@ -1,0 +1,32 @@
+"""Taichi and Quadrants make the same bits."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lagbench.data.registry import load
+from lagbench.work.engine import ENGINE_VARIABLE, ENGINES
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("split", load().splits)
+def test_every_engine_makes_the_bits_of_tiny(
+    split: str, engine: str, tmp_path: Path
+) -> None:
+    """The data set of ``generate`` has the hash of datasets.yaml, else it fails."""
+    if importlib.util.find_spec(engine) is None:
+        pytest.skip(f"{engine} is not installed")
+    command = [sys.executable, "-m", "lagbench", "generate", "--split", split]
+    options = ["--size", "tiny", "--workers", "1", "--root", str(tmp_path), "--json"]
+    done = subprocess.run(
+        [*command, *options],
+        env=os.environ | {ENGINE_VARIABLE: engine},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
