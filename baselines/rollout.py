@@ -32,7 +32,7 @@ from lagbench.metrics.table import METRICS, ranking_metric, select
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.store.copy import scenario_files
 from lagbench.store.windows import copy_window
-from lagbench.submission.checks import MAX_DISTANCE
+from lagbench.submission.validation import MAX_DISTANCE
 from lagbench.tensors import TensorWindow, collate
 from lagbench.torch import tensors
 

@@ -30,8 +30,7 @@ from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import METRICS
 from lagbench.references.predictor import given_in
 from lagbench.references.table import references_of
-from lagbench.scoring.scenario import measure_rows
-from lagbench.scoring.task import load_scored_task
+from lagbench.scoring.task import load_scored_task, measure_rows
 from lagbench.submission.predictions import open_predictions
 
 NAMES = ("cloud_distance", "motion_distance")

@@ -35,6 +35,7 @@ from lagbench.exchange.local_split import LocalSplit
 from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
+from lagbench.metrics.metric import Metric
 from lagbench.scoring import score as scorer
 from lagbench.scoring.score import ScenarioScores
 from lagbench.scoring.task import ScoredTask
@@ -211,7 +212,7 @@ def references_once() -> Iterator[None]:
         path: Path,
         info: FileInfo,
         *,
-        metrics: Names,
+        metrics: tuple[Metric, ...],
         references: Names,
         workers: int | None,
         scheduler: str | None,

@@ -16,10 +16,14 @@ from lagbench.references.predictor import given_in
 from lagbench.references.shipped import shipped
 from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.scoring.references import check_train
-from lagbench.scoring.scenario import SUBMISSION, measure_rows, predict_reference
-from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import best_reference
-from lagbench.scoring.task import load_scored_task
+from lagbench.scoring.task import (
+    SUBMISSION,
+    load_scored_task,
+    measure_rows,
+    predict_reference,
+)
 from lagbench.work.run import Meter, Progress
 
 from .entry import Entry
@@ -150,8 +154,8 @@ def _score_entry(
             )
         finally:
             model.close()
-        stored = read_score_file(folder.path / entry.score_paths[index])
-        public = score(metric, stored.scores.tallies)
+        stored = read_statistics(folder.path / entry.score_paths[index])
+        public = score(metric, stored.tallies)
         blind = score(metric, model_tallies)
         public_mean = float("nan") if public is None else public.mean
         blind_mean = float("nan") if blind is None else blind.mean

@@ -23,9 +23,11 @@ from lagbench.metrics.table import STATISTICS
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.scoring.score_file import SubmissionStatistics
-from lagbench.scoring.score_file_checks import read_score_file
-from lagbench.scoring.score_file_writer import write_statistics
+from lagbench.scoring.score_file import (
+    SubmissionStatistics,
+    read_statistics,
+    write_statistics,
+)
 from lagbench.work.run import Progress
 
 from .entry import (
@@ -192,7 +194,7 @@ def check_entry(folder: Folder, path: Path, entry: Entry, size: Size) -> Iterato
             )
             continue
         try:
-            scores = read_score_file(whole_path, size if current else None).scores
+            scores = read_statistics(whole_path, size if current else None)
         except LagbenchError as error:
             yield str(error)
             continue
@@ -244,7 +246,7 @@ def _check_reference(folder: Folder, path: Path, registry: Registry) -> Iterator
     """Yield why a file cannot hold the scores of a reference predictor."""
     try:
         size = registry.size(*path.parts[1:3])
-        read_score_file(folder.path / path, size)
+        read_statistics(folder.path / path, size)
     except LagbenchError as error:
         yield str(error)
         return
@@ -293,11 +295,11 @@ def _rescore(
         for file, score_path in zip(entry.score.files, entry.score_paths, strict=True):
             if file.predictions_sha256 != card.predictions_sha256:
                 continue
-            stored = read_score_file(folder.path / score_path).scores
+            stored = read_statistics(folder.path / score_path)
             with tempfile.TemporaryDirectory() as scratch:
                 new_path = Path(scratch) / "scores.nc"
                 write_statistics(card, new_path)
-                scored = read_score_file(new_path).scores
+                scored = read_statistics(new_path)
             differing, difference = compare_tallies(scored.tallies, stored.tallies)
             if differing:
                 raise ChecksFailedError(

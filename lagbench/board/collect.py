@@ -28,9 +28,9 @@ from lagbench.scoring.front import (
     compute_speedup,
     seconds_where_measured,
 )
-from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import compute_skill
-from lagbench.submission.task_checks import frames_to_predict
+from lagbench.submission.truth import frames_to_predict
 
 from .entry import Entry, Status, data_set_of, is_current, read_entry
 from .folder import Folder
@@ -276,7 +276,7 @@ def _read_row(
         names = {*records.metrics, ranking, EARLY_ERROR}
     stored = []
     for path in entry.score_paths:
-        stored.append(read_score_file(records.folder.path / path, size).scores)
+        stored.append(read_statistics(records.folder.path / path, size))
     combined = combine([scores.tallies for scores in stored], names)
     if ranking not in combined:
         raise ChecksFailedError(f"{entry.yaml_path}: its score files lack {ranking}")
@@ -478,11 +478,11 @@ def _read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
     references = []
     for path in folder.reference_files(size.split, size.name):
         file = folder.path / path
-        stored = read_score_file(file).scores
+        stored = read_statistics(file)
         is_known = path.stem in REFERENCES
         if not is_known or not is_current(data_set_of(stored.identity), size):
             continue
-        read_score_file(file, size)  # refuses scores that do not fit the task
+        read_statistics(file, size)  # refuses scores that do not fit the task
         combined = combine([stored.tallies])
         scores = {}
         for name, combined_score in combined.items():

@@ -16,8 +16,7 @@ from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
 from lagbench.models.onnx_model import open_onnx
-from lagbench.scoring.scenario import SUBMISSION, measure_rows
-from lagbench.scoring.task import ScoredTask
+from lagbench.scoring.task import SUBMISSION, ScoredTask, measure_rows
 
 from .entry import Entry, Prediction, Status, find_model, is_current, read_entry
 from .folder import Folder

@@ -22,11 +22,10 @@ from lagbench.metrics.aggregate import (
     mean_over_seeds,
 )
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.front import digits
 
 from .entry import LONGEST_TEXT, EntryFlag, ScoredFile, Summary
-
-OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,25 +113,16 @@ def summarise(scores: Mapping[str, CombinedScore]) -> dict[str, Summary]:
     return summaries
 
 
-def scored_file(
-    card: ScoreCard, path: Path, outside_share: float | None = None
-) -> ScoredFile:
-    """Return the description of a card's score file in an entry.
-
-    Args:
-        card: scores of predictions.
-        path: the score file.
-        outside_share: share of positions beyond the box, where the validation warns.
-    """
+def scored_file(card: ScoreCard, path: Path) -> ScoredFile:
+    """Return the description of a card's score file in an entry."""
     flags = []
     for flag in card.flags:
         if flag.raised:
             flags.append(_entry_flag(flag.name, flag.reasons))
     warnings = []
     for issue in card.warnings:
-        share = outside_share if issue.check == OUTSIDE else None
-        reason = f"{issue.what}: {issue.got}"
-        warnings.append(_entry_flag(issue.check, [reason], share=share))
+        reason = f"{issue.where}: {issue.what}"
+        warnings.append(_entry_flag(issue.check, [reason], share=issue.share))
     return ScoredFile(
         sha256=file_sha256(path),
         predictions_sha256=card.predictions_sha256,

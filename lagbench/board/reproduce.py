@@ -31,7 +31,7 @@ from lagbench.metrics.aggregate import Tally, score
 from lagbench.metrics.table import METRICS
 from lagbench.references.predictor import Kind, given_in
 from lagbench.references.table import references_of
-from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.machine import available_cores, processor_name
 from lagbench.work.run import Meter, Progress
@@ -270,7 +270,7 @@ class _Run:
                 if recorded.get(prediction.seed, 0) >= len(chosen):
                     continue
             name = name_seed(entry, prediction)
-            stored = read_score_file(self.folder.path / entry.score_paths[index])
+            stored = read_statistics(self.folder.path / entry.score_paths[index])
             model = self._open(entry, prediction)
             self.meter.begin(name, total=len(chosen), scenarios=len(chosen))
             try:
@@ -285,7 +285,7 @@ class _Run:
                 model.close()
             reproduction = compare(
                 entry.score.ranking_metric,
-                {scenario: stored.scores.tallies[scenario] for scenario in chosen},
+                {scenario: stored.tallies[scenario] for scenario in chosen},
                 tallies,
                 seed=prediction.seed,
                 model=prediction.weights.sha256,

@@ -9,7 +9,7 @@ from typing import Any
 from lagbench.errors import UsageError, suggest_name
 from lagbench.figures.tables import Table
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.card import digits
+from lagbench.scoring.front import digits
 
 from .columns import MAIN_COLUMNS, columns_of, describe_check, format_number
 from .rows import Board, Row, Tab, Value, conclude

@@ -29,11 +29,13 @@ from lagbench.errors import (
 from lagbench.models.onnx_model import check_onnx
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
-from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
-from lagbench.scoring.score_file_writer import write_statistics
-from lagbench.submission.checks import outside_share
+from lagbench.scoring.score_file import (
+    MAX_SCORE_BYTES,
+    read_statistics,
+    write_statistics,
+)
+from lagbench.scoring.task import SUBMISSION
 from lagbench.submission.format import WRITE, Header
 from lagbench.submission.issues import ValidationResult
 from lagbench.submission.predictions import open_predictions
@@ -67,7 +69,7 @@ from .folder import (
     score_paths,
     weights_path,
 )
-from .ranking import OUTSIDE, combine, scored_file, summarise
+from .ranking import combine, scored_file, summarise
 from .shift import remove_stale_scores
 from .verified import remove_stale_record
 
@@ -92,8 +94,6 @@ class PredictionsFile:
     header: Header
     sha256: str  # content hash
     validation: ValidationResult
-    # share of positions beyond the box, where the validation warns
-    outside_share: float | None
     weights: Path | None = None
 
 
@@ -228,15 +228,11 @@ def _read_predictions(
         provenance = header.provenance
         if provenance is not None and {"test", "shift"} & set(provenance.subsets):
             raise UsageError(f"{path}: the model was trained on scored scenarios")
-        share = None
-        if any(warning.check == OUTSIDE for warning in validation.warnings):
-            share = outside_share(opened, registry.size(header.split, header.size))
         return PredictionsFile(
             path=path,
             header=header,
             sha256=validation.sha256 or opened.content_sha256(),
             validation=validation,
-            outside_share=share,
         )
 
 
@@ -349,7 +345,7 @@ def _publish(
                     f"the scores take more than {MAX_SCORE_BYTES} bytes; no "
                     "leaderboard takes a data set of so many scenarios"
                 )
-            scored_files.append(scored_file(card, copy, file.outside_share))
+            scored_files.append(scored_file(card, copy))
             predictions.append(
                 Prediction(
                     seed=file.header.seed,
@@ -495,7 +491,7 @@ def _write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
         path.parent.mkdir(parents=True, exist_ok=True)
         reference_card = replace(
             card,
-            header=replace(header, method=name),
+            header=header.model_copy(update={"method": name}),
             predictions_sha256=NO_PREDICTIONS,
             tallies={SUBMISSION: card.tallies[name]},
         )
@@ -506,6 +502,6 @@ def _write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
 
 def _is_scored_on(path: Path, dataset_sha256: str) -> bool:
     with suppress(UnreadableFileError):
-        identity = read_score_file(path).scores.identity
+        identity = read_statistics(path).identity
         return identity["dataset_sha256"] == dataset_sha256
     return False

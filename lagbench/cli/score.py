@@ -13,12 +13,7 @@ from lagbench.errors import UsageError
 from lagbench.figures.report.report import check_folder, write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import check_extras, score, scores_folder
-from lagbench.scoring.tables import (
-    brief_lines,
-    brief_table,
-    card_tables,
-    flag_lines,
-)
+from lagbench.scoring.tables import brief_table, card_lines, card_tables
 from lagbench.submission.issues import ValidationResult
 from lagbench.submission.validation import validate
 
@@ -115,11 +110,9 @@ def _print_cards(cards: Sequence[ScoreCard], *, every: bool) -> None:
     for card in cards:
         if every:
             print_tables(card_tables(card, every=True, all_references=True))
-            lines = flag_lines(card, every=every)
         else:
             print_tables([brief_table(card)])
-            lines = brief_lines(card)
-        for line in lines:
+        for line in card_lines(card, brief=not every, every=every):
             print_line(line)
         print_line(f"written: {', '.join(map(str, card.files))}")
     if not every:

@@ -10,31 +10,32 @@ import json
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lagbench.data.checksums import round_digits
 from lagbench.errors import UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally
 from lagbench.metrics.frame import TaskConfig
-from lagbench.metrics.metric import Metric, mean
+from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import Comparison, compare
 from lagbench.metrics.table import CHOSEN
-from lagbench.submission.format import Header
+from lagbench.submission.format import IDENTITY, Header
 from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
-from .front import NoSpeedup, Speedup
-from .published_scores import FORMAT, IDENTITY
-from .scenario import SUBMISSION, Preview
+from .front import NoSpeedup, Speedup, digits
 from .skill import Skill
+from .task import SUBMISSION
 
 if TYPE_CHECKING:
     import pandas as pd
 
 JSON_NAME = "scores.json"
+
+FORMAT = 1
+"""Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
 
 BRIEF_ROWS = 5
 """Metrics that a short table shows."""
@@ -62,7 +63,6 @@ class ScoreCard:
     speedup: Speedup | NoSpeedup  # over the classical side, or why there is none
     flags: tuple[Flag, ...]  # hints for the reader of a score
     warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
-    preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
 
     def __repr__(self) -> str:
@@ -163,17 +163,10 @@ class ScoreCard:
         references = [name for name in self.scores if name != SUBMISSION]
         if row not in references:
             raise UsageError(
-                f"no reference {row!r} beside the submission",
-                where="against, row",
-                expected="the name of a reference that was scored beside it",
-                got=ascii(row),
-                fix=suggest_name(str(row), references),
+                f"no reference {row!r} beside the submission; "
+                f"{suggest_name(str(row), references)}"
             )
         return compare(self.submission[self.ranking], self.scores[row][self.ranking])
-
-    def at(self, path: Path, *more: Path) -> ScoreCard:
-        """Return this card with the files that it was written to."""
-        return replace(self, files=(path, *more))
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of scores.json."""
@@ -188,11 +181,9 @@ class ScoreCard:
             if label is not None:
                 content[name] = label
 
-        diverged_at = sorted(self.header.diverged_at.items())
-        diverged = {}
-        for i, frame in diverged_at:
-            diverged[str(i)] = frame
-        content["diverged_at"] = diverged
+        content["diverged_at"] = {
+            str(i): frame for i, frame in sorted(self.header.diverged_at.items())
+        }
         content["task"] = {
             "input_frames": self.config.input_frames,
             "horizon": self.config.horizon,
@@ -200,52 +191,73 @@ class ScoreCard:
             "scenarios": list(self.scenarios),
         }
         content["ranking_metric"] = self.ranking
-        content["skill"] = _skill_as_json(self.skill)
+        content["skill"] = None
+        if self.skill is not None:
+            content["skill"] = {
+                "floor": self.skill.reference,
+                "value": digits(self.skill.value),
+                "interval": _bounds(self.skill.interval),
+            }
         content["speedup"] = None
         if isinstance(self.speedup, Speedup):
-            content["speedup"] = _speedup_as_json(self.speedup)
+            content["speedup"] = self.speedup.as_json()
         else:
             content["why_no_speedup"] = str(self.speedup)
 
-        metrics = {}
+        content["metrics"] = {}
         for score in self.submission.values():
-            metrics[score.metric.name] = _metric_as_json(score.metric)
-        content["metrics"] = metrics
-
-        rows = {}
-        for row in self.scores:
-            rows[row] = self._row_as_json(row)
-        content["rows"] = rows
-
-        comparisons = {}
-        for row in self.scores:
+            metric = score.metric
+            content["metrics"][metric.name] = {
+                "family": metric.family,
+                "unit": metric.unit,
+                "direction": str(metric.direction),
+                "perfect": metric.perfect,
+                "source": metric.source,
+                "summary": metric.summary,
+            }
+        content["rows"] = {}
+        content["against"] = {}
+        for row, scores in self.scores.items():
+            content["rows"][row] = {
+                name: self._score_as_json(row, score) for name, score in scores.items()
+            }
             if row != SUBMISSION:
-                comparisons[row] = _comparison_as_json(self.against(row))
-        content["against"] = comparisons
-
-        flags = {}
+                comparison = self.against(row)
+                content["against"][row] = {
+                    "metric": comparison.metric,
+                    "difference": digits(comparison.difference),
+                    "interval": _bounds(comparison.interval),
+                    "p": digits(comparison.p),
+                }
+        content["flags"] = {}
         for flag in self.flags:
-            flags[flag.name] = _flag_as_json(flag)
-        content["flags"] = flags
-        warnings = []
-        for warning in self.warnings:
-            warnings.append(
-                {"check": warning.check, "what": warning.what, "got": warning.got}
-            )
-        content["warnings"] = warnings
+            evidence = {name: digits(value) for name, value in flag.evidence.items()}
+            content["flags"][flag.name] = {
+                "raised": flag.raised,
+                "reasons": list(flag.reasons),
+                "evidence": evidence,
+            }
+        content["warnings"] = [
+            {"check": one.check, "where": one.where, "what": one.what}
+            for one in self.warnings
+        ]
         return content
 
-    def _row_as_json(self, row: str) -> dict[str, Any]:
-        """Return the scores of a row, by metric."""
-        scores = {}
-        for name, score in self.scores[row].items():
-            scores[name] = _score_as_json(score)
-            if score.metric.per_frame:
-                at = {}
-                for frame in self.reported_frames:
-                    at[str(frame)] = _frame_as_json(score, frame, row)
-                scores[name]["at"] = at
-        return scores
+    def _score_as_json(self, row: str, score: Score) -> dict[str, Any]:
+        content: dict[str, Any] = {
+            "mean": digits(score.mean),
+            "interval": _bounds(score.interval),
+            "values": [digits(value) for value in score.values.tolist()],
+            "undefined": list(score.undefined),
+        }
+        if score.metric.per_frame:
+            content["at"] = {}
+            for frame in self.reported_frames:
+                at: dict[str, Any] = {"mean": digits(mean(score.at(frame)))}
+                if row == SUBMISSION:
+                    at["interval"] = _bounds(score.interval_at(frame))
+                content["at"][str(frame)] = at
+        return content
 
 
 def number_methods(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
@@ -273,86 +285,8 @@ def number_methods(methods: Sequence[str], taken: Collection[str] = ()) -> list[
     return names
 
 
-def digits(value: float) -> float | None:
-    """Return a number with nine significant digits, None where it is not finite.
-
-    >>> digits(2 / 3)
-    0.666666667
-    """
-    if math.isfinite(value):
-        return round_digits(value)
-    return None
-
-
-def _interval_as_json(interval: tuple[float, float]) -> list[float | None]:
+def _bounds(interval: tuple[float, float]) -> list[float | None]:
     return [digits(bound) for bound in interval]
-
-
-def _score_as_json(score: Score) -> dict[str, Any]:
-    return {
-        "mean": digits(score.mean),
-        "interval": _interval_as_json(score.interval),
-        "values": [digits(value) for value in score.values.tolist()],
-        "undefined": list(score.undefined),
-    }
-
-
-def _frame_as_json(score: Score, frame: int, row: str) -> dict[str, Any]:
-    content: dict[str, Any] = {"mean": digits(mean(score.at(frame)))}
-    if row == SUBMISSION:
-        content["interval"] = _interval_as_json(score.interval_at(frame))
-    return content
-
-
-def _metric_as_json(metric: Metric) -> dict[str, Any]:
-    """Return what a metric is, without any value: unit, direction, source."""
-    return {
-        "family": metric.family,
-        "unit": metric.unit,
-        "direction": str(metric.direction),
-        "perfect": metric.perfect,
-        "source": metric.source,
-        "summary": metric.summary,
-    }
-
-
-def _skill_as_json(skill: Skill | None) -> dict[str, Any] | None:
-    if skill is None:
-        return None
-    return {
-        "floor": skill.reference,
-        "value": digits(skill.value),
-        "interval": _interval_as_json(skill.interval),
-    }
-
-
-def _speedup_as_json(speedup: Speedup) -> dict[str, Any]:
-    return {
-        "value": digits(speedup.value),
-        "interval": _interval_as_json(speedup.interval),
-        "at_least": speedup.at_least,
-        "classical_seconds": digits(speedup.classical_seconds),
-    }
-
-
-def _comparison_as_json(comparison: Comparison) -> dict[str, Any]:
-    return {
-        "metric": comparison.metric,
-        "difference": digits(comparison.difference),
-        "interval": _interval_as_json(comparison.interval),
-        "p": digits(comparison.p),
-    }
-
-
-def _flag_as_json(flag: Flag) -> dict[str, Any]:
-    evidence = {}
-    for name, value in flag.evidence.items():
-        evidence[name] = digits(value)
-    return {
-        "raised": flag.raised,
-        "reasons": list(flag.reasons),
-        "evidence": evidence,
-    }
 
 
 def format_scores(card: ScoreCard) -> bytes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,12 +32,17 @@ from lagbench.metrics.significance import compare as compare_scores
 from lagbench.references.table import REFERENCES
 
 from .boards import find_board
-from .card import JSON_NAME, digits, number_methods
-from .published_scores import PublishedScores, parse_scores, read_scores
-from .scenario import SUBMISSION
+from .card import JSON_NAME, number_methods
+from .front import digits
+from .published_scores import (
+    PublishedScores,
+    parse_scores,
+    read_published_scores,
+    read_scores,
+)
 from .score import score
 from .score_file import NETCDF_NAME
-from .score_file_checks import MAX_SCORE_BYTES, read_published_scores
+from .task import SUBMISSION
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -137,50 +142,24 @@ class ComparisonResult:
         """The result in the ranking metric, in one sentence."""
         if self.same_predictions:
             return "both hold the same predictions"
-        if self.scenarios < FEWEST_SCENARIOS:
-            return self._verdict_of_few
-
-        test = self.metrics[self.ranking].test
-        if not test.significant:
-            return f"{self.ranking}: no difference at 5 % ({self._sample})"
-        better = self.second
-        if test.difference < 0.0:
-            better = self.first
-        return f"{self.ranking}: {better} is better ({self._sample})"
-
-    @property
-    def _verdict_of_few(self) -> str:
-        """The verdict of too few scenarios for a p-value."""
-        verb = "decides" if self.scenarios == 1 else "decide"
-        verdict = (
-            f"{format_count(self.scenarios, 'scenario')} {verb} nothing: a test needs "
-            f"{FEWEST_SCENARIOS}"
-        )
-        if self.scenarios < FEWEST_FOR_INTERVAL:
-            return f"{verdict}, an interval {FEWEST_FOR_INTERVAL}"
-        return f"{verdict}; read the intervals"
-
-    @property
-    def _sample(self) -> str:
-        """The p-value with the number of scenarios and seeds behind it."""
-        p = self.metrics[self.ranking].test.p
         scenarios = format_count(self.scenarios, "scenario")
-        return f"p = {p:.3g}, {scenarios}, {self._seeds_in_words}"
-
-    @property
-    def _seeds_in_words(self) -> str:
-        first, second = self.seeds
-        if self.is_against_reference and first == 1:
-            return "one seed: these weights, not the method"
-        if self.is_against_reference:
-            return f"{first} seeds"
-        if first == second == 1:
-            return "one seed each: these weights, not the methods"
-        if 1 in self.seeds:
-            return (
-                f"{first} and {second} seeds: of one seed its weights, not the method"
-            )
-        return f"{first} and {second} seeds"
+        if self.scenarios < FEWEST_SCENARIOS:
+            advice = "; read the intervals"
+            if self.scenarios < FEWEST_FOR_INTERVAL:
+                advice = f", an interval {FEWEST_FOR_INTERVAL}"
+            verb = "decides" if self.scenarios == 1 else "decide"
+            needs = f"a test needs {FEWEST_SCENARIOS}{advice}"
+            return f"{scenarios} {verb} nothing: {needs}"
+        test = self.metrics[self.ranking].test
+        counts = self.seeds[:1] if self.is_against_reference else self.seeds
+        seeds = f"{' and '.join(map(str, counts))} seeds"
+        if 1 in counts:
+            seeds += ": of one seed its weights, not the method"
+        sample = f"p = {test.p:.3g}, {scenarios}, {seeds}"
+        if not test.significant:
+            return f"{self.ranking}: no difference at 5 % ({sample})"
+        better = self.first if test.difference < 0.0 else self.second
+        return f"{self.ranking}: {better} is better ({sample})"
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the comparison as a table with a line for each metric.
@@ -195,28 +174,40 @@ class ComparisonResult:
 
         lines = []
         for name, comparison in self.metrics.items():
-            test = comparison.test
-            low, high = test.interval
-            line = {
-                "metric": name,
-                "unit": comparison.metric.unit,
-                "side": comparison.side,
-                "first": comparison.first,
-                "second": comparison.second,
-                "difference": test.difference,
-                "low": low,
-                "high": high,
-                "p": test.p,
-                "significant": test.significant,
-            }
-            lines.append(line)
+            low, high = comparison.test.interval
+            lines.append(
+                {
+                    "metric": name,
+                    "unit": comparison.metric.unit,
+                    "side": comparison.side,
+                    "first": comparison.first,
+                    "second": comparison.second,
+                    "difference": comparison.test.difference,
+                    "low": low,
+                    "high": high,
+                    "p": comparison.test.p,
+                    "significant": comparison.test.significant,
+                }
+            )
         return pd.DataFrame(lines)
 
     def as_json(self) -> dict[str, Any]:
         """Return the comparison as plain values; undefined ones are None."""
         metrics = {}
         for name, comparison in self.metrics.items():
-            metrics[name] = _metric_as_json(comparison)
+            test = comparison.test
+            metrics[name] = {
+                "unit": comparison.metric.unit,
+                "side": comparison.side,
+                "first": digits(comparison.first),
+                "second": digits(comparison.second),
+                "undefined": list(comparison.undefined),
+                "difference": digits(test.difference),
+                "interval": [digits(bound) for bound in test.interval],
+                "p": digits(test.p),
+                "significant": test.significant,
+                "scenarios": list(test.scenarios),
+            }
         return {
             "split": self.split,
             "size": self.size,
@@ -229,23 +220,6 @@ class ComparisonResult:
             "seeds": list(self.seeds),
             "metrics": metrics,
         }
-
-
-def _metric_as_json(comparison: MetricComparison) -> dict[str, Any]:
-    """Return one metric of two methods as plain values; undefined ones are None."""
-    test = comparison.test
-    return {
-        "unit": comparison.metric.unit,
-        "side": comparison.side,
-        "first": digits(comparison.first),
-        "second": digits(comparison.second),
-        "undefined": list(comparison.undefined),
-        "difference": digits(test.difference),
-        "interval": [digits(bound) for bound in test.interval],
-        "p": digits(test.p),
-        "significant": test.significant,
-        "scenarios": list(test.scenarios),
-    }
 
 
 def compare(
@@ -295,19 +269,19 @@ def compare(
     def load(name: str | Path) -> Contestant:
         seeds = []
         for path in find_scores(name, board):
-            seeds.append(
-                _load_scores(
+            seed = _read_seed(path)
+            if seed is None:
+                card = score(
                     path,
-                    lambda path: score(
-                        path,
-                        split=expected_split,
-                        root=root,
-                        workers=workers,
-                        registry=registry,
-                        write=False,
-                    ).as_json(),
+                    split=expected_split,
+                    root=root,
+                    workers=workers,
+                    registry=registry,
+                    write=False,
                 )
-            )
+                # through JSON, so that its digits are those of a scores.json
+                seed = parse_scores(card.as_json())
+            seeds.append(seed)
         contestant = Contestant(name=str(name), seeds=tuple(seeds))
         _check_seeds(contestant, expected_split)
         return contestant
@@ -318,7 +292,13 @@ def compare(
     one = load(first)
     is_reference = is_bare and str(second) in one.seeds[0].scores
     if is_reference:
-        two = _reference_beside(one, str(second))
+        reference = replace(
+            one.seeds[0],
+            identity={**one.identity, "method": str(second)},
+            predictions_sha256="",
+            scores={SUBMISSION: one.seeds[0].scores[str(second)]},
+        )
+        two = Contestant(name=str(second), seeds=(reference,))
     elif is_bare and not Path(second).suffix:
         two = load(f"{one.identity['split']}/{one.identity['size']}/{second}")
     else:
@@ -400,19 +380,14 @@ def find_scores(source: str | Path, board: str | Path | None = None) -> list[Pat
     return files
 
 
-def _load_scores(
-    path: Path, score_predictions: Callable[[Path], Mapping[str, Any]]
-) -> PublishedScores:
-    """Return the scores of a scores.json, a scores.nc or a predictions.nc."""
+def _read_seed(path: Path) -> PublishedScores | None:
+    """Return the scores of a scores.json or scores.nc, None of other files."""
     if path.suffix == ".json":
         return read_scores(path)
-    if path.stat().st_size <= MAX_SCORE_BYTES:
-        try:
-            return read_published_scores(path.resolve())
-        except UnreadableFileError:
-            pass  # it may be predictions
-    # through JSON, so that its digits are those of a scores.json
-    return parse_scores(score_predictions(path))
+    try:
+        return read_published_scores(path.resolve())
+    except UnreadableFileError:
+        return None  # it may be predictions
 
 
 def _check_seeds(contestant: Contestant, expected_split: str | None) -> None:
@@ -447,18 +422,6 @@ def _check_seeds(contestant: Contestant, expected_split: str | None) -> None:
         )
 
 
-def _reference_beside(contestant: Contestant, name: str) -> Contestant:
-    """Return a reference that was scored beside a method."""
-    seed = contestant.seeds[0]
-    reference = replace(
-        seed,
-        identity={**seed.identity, "method": name},
-        predictions_sha256="",
-        scores={SUBMISSION: seed.scores[name]},
-    )
-    return Contestant(name=name, seeds=(reference,))
-
-
 def _check_same(one: Mapping[str, str], two: Mapping[str, str]) -> None:
     """Refuse scores on two data sets."""
     for key in SAME:
@@ -478,11 +441,11 @@ def _compare_metrics(
         metrics = (metrics,)
     first_scores = one.scores
     second_scores = two.scores
-    judging = []
-    for name, scores in first_scores.items():
-        judges = scores[0].metric.direction is not Direction.NONE
-        if judges and name in second_scores:
-            judging.append(name)
+    judging = [
+        name
+        for name, scores in first_scores.items()
+        if name in second_scores and scores[0].metric.direction is not Direction.NONE
+    ]
     if one.ranking not in judging:
         raise UnreadableFileError(
             f"the scores of {two.name} lack {one.ranking}, which ranks; score the "
@@ -495,10 +458,8 @@ def _compare_metrics(
                 f"{suggest_name(name, judging)}"
             )
     chosen = set(metrics or judging)
-    names = [one.ranking]
-    for name in judging:
-        if name in chosen and name != one.ranking:
-            names.append(name)
+    others = [name for name in judging if name in chosen and name != one.ranking]
+    names = [one.ranking, *others]
 
     of_one = first_scores[one.ranking][0].scenarios
     of_two = second_scores[one.ranking][0].scenarios
@@ -510,23 +471,16 @@ def _compare_metrics(
         )
     comparisons = {}
     for name in names:
-        comparisons[name] = _compare_metric(first_scores[name], second_scores[name])
+        means = []
+        undefined = []
+        for seeds in (first_scores[name], second_scores[name]):
+            means.append(mean(mean_over_seeds([seed.values for seed in seeds])))
+            undefined.append(sum(sum(seed.undefined) for seed in seeds))
+        comparisons[name] = MetricComparison(
+            metric=first_scores[name][0].metric,
+            first=means[0],
+            second=means[1],
+            undefined=(undefined[0], undefined[1]),
+            test=compare_scores(first_scores[name], second_scores[name]),
+        )
     return comparisons
-
-
-def _compare_metric(
-    first: Sequence[Score], second: Sequence[Score]
-) -> MetricComparison:
-    """Compare the seeds of two methods in one metric."""
-    means = []
-    undefined = []
-    for seeds in (first, second):
-        means.append(mean(mean_over_seeds([seed.values for seed in seeds])))
-        undefined.append(sum(sum(seed.undefined) for seed in seeds))
-    return MetricComparison(
-        metric=first[0].metric,
-        first=means[0],
-        second=means[1],
-        undefined=(undefined[0], undefined[1]),
-        test=compare_scores(first, second),
-    )

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import counted_nodes
-from lagbench.errors import format_count
 from lagbench.metrics.frame import FramePair, Scenario, average, dot, mean_square
 from lagbench.metrics.metric import mean, quotient
 
@@ -80,70 +79,55 @@ class Tracer:
     """Collects the trace of one scenario, frame pair by frame pair."""
 
     def __init__(self, scenario: Scenario) -> None:
-        frame_count = scenario.config.horizon
         longest = max(SHIFTS)
         last_inputs = np.asarray(scenario.input_positions[-2:], np.float64)
         self._first = scenario.config.input_frames
         self._true = deque(last_inputs, maxlen=longest)
         self._predicted: deque[Floats] = deque(maxlen=longest)
         self._error: Floats | None = None
-        shifted = {}
-        for shift in SHIFTS:
-            shifted[shift] = np.full(frame_count, np.nan)
-        self._trace = Trace(
-            error=np.full(frame_count, np.nan),
-            overlap=np.full(frame_count, np.nan),
-            motion=np.full(frame_count, np.nan),
-            predicted_motion=np.full(frame_count, np.nan),
-            shifted=shifted,
-            occupancy=np.full(frame_count, np.nan),
-            outside=np.full(frame_count, np.nan),
+
+        def unknown() -> Floats:
+            return np.full(scenario.config.horizon, np.nan)
+
+        self.trace = Trace(
+            error=unknown(),
+            overlap=unknown(),
+            motion=unknown(),
+            predicted_motion=unknown(),
+            shifted={shift: unknown() for shift in SHIFTS},
+            occupancy=unknown(),
+            outside=unknown(),
         )
 
     def add(self, pair: FramePair) -> None:
         """Add the next frame."""
         i = pair.frame - self._first
-        trace = self._trace
+        trace = self.trace
         error = pair.position_error
-
         trace.error[i] = average(pair.position_square)
         if self._error is not None:
             trace.overlap[i] = sum(map(dot, error.T, self._error.T)) / error.size
+        self._error = error
         trace.motion[i] = pair.truth.speed_square / error.size
         trace.predicted_motion[i] = pair.prediction.speed_square / error.size
-        trace.occupancy[i] = _occupancy(pair)
+        weight = pair.prediction.fields.weight
+        is_filled = counted_nodes(weight, pair.scenario.full_weight)
+        true_count = int(np.count_nonzero(pair.truth.fields.counted))
+        trace.occupancy[i] = int(np.count_nonzero(is_filled)) / max(1, true_count)
         trace.outside[i] = pair.outside_share
-        self._add_shifted(i, pair)
-        self._error = error
 
-    def _add_shifted(self, i: int, pair: FramePair) -> None:
-        """Compare the frame with earlier ones, of truth and of prediction."""
+        # the frame beside earlier ones, of truth and of prediction
         box = pair.scenario.config.box
         true = pair.truth.position
         predicted = pair.prediction.position
-        shifted = self._trace.shifted
-
         for back, earlier in enumerate(reversed(self._true), start=1):
             way = box.displacement(earlier, predicted)
-            shifted[-back][i] = average(mean_square(way))
+            trace.shifted[-back][i] = average(mean_square(way))
         for back, earlier in enumerate(reversed(self._predicted), start=1):
             way = box.displacement(true, earlier)
-            shifted[back][i - back] = average(mean_square(way))
-
+            trace.shifted[back][i - back] = average(mean_square(way))
         self._true.append(true)
         self._predicted.append(predicted)
-
-    def result(self) -> Trace:
-        """Return the trace of the frames that were added."""
-        return self._trace
-
-
-def _occupancy(pair: FramePair) -> float:
-    """Return the nodes that the prediction fills over those that the truth fills."""
-    weight = pair.prediction.fields.weight
-    is_filled = counted_nodes(weight, pair.scenario.full_weight)
-    true_count = int(np.count_nonzero(pair.truth.fields.counted))
-    return int(np.count_nonzero(is_filled)) / max(1, true_count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,37 +163,27 @@ def analyse_error(trace: Trace) -> ErrorDynamics:
     is_above_rounding = before > ROUNDING**2
     cosine = quotient(trace.overlap[1:], np.sqrt(error * before))[is_above_rounding]
     fall = np.sqrt(quotient(error, before))[is_above_rounding]
-    drop = math.nan
-    if fall.size:
-        drop = float(np.min(fall))
-
-    shift, shift_gain = _best_shift(trace)
+    best_shift = 0
+    shift_gain = 1.0
+    for shift, shifted in trace.shifted.items():
+        is_known = ~np.isnan(shifted)
+        shifted_error = float(np.sum(shifted[is_known]))
+        gain = _root_ratio(shifted_error, float(np.sum(trace.error[is_known])))
+        if gain < shift_gain:
+            best_shift = shift
+            shift_gain = gain
     quarter = max(1, len(trace.error) // 4)
     late_error = float(np.mean(trace.error[-quarter:]))
     is_exact = (trace.error == 0.0) & (trace.motion > 0.0)
     return ErrorDynamics(
         autocorrelation=mean(cosine),
-        drop=drop,
-        shift=shift,
+        drop=float(np.min(fall)) if fall.size else math.nan,
+        shift=best_shift,
         shift_gain=shift_gain,
         growth=_root_ratio(late_error, float(trace.error[0])),
         steps=_root_ratio(float(np.max(trace.error)), float(np.mean(trace.motion))),
         exact=int(np.count_nonzero(is_exact)),
     )
-
-
-def _best_shift(trace: Trace) -> tuple[int, float]:
-    """Return the shift with the least share of the RMS error, and that share."""
-    best = 0
-    least = 1.0
-    for shift, shifted in trace.shifted.items():
-        is_known = ~np.isnan(shifted)
-        shifted_error = float(np.sum(shifted[is_known]))
-        gain = _root_ratio(shifted_error, float(np.sum(trace.error[is_known])))
-        if gain < least:
-            best = shift
-            least = gain
-    return best, least
 
 
 def judge_copying(traces: Sequence[Trace]) -> Flag:
@@ -218,35 +192,28 @@ def judge_copying(traces: Sequence[Trace]) -> Flag:
     One such scenario is enough. A constant offset beyond a frame's motion, or a share
     of the truth mixed into a rollout, is not seen.
     """
-    scenarios = []
-    for trace in traces:
-        scenarios.append(analyse_error(trace))
+    scenarios = [analyse_error(trace) for trace in traces]
     exact = sum(scenario.exact for scenario in scenarios)
-    verb = "is" if exact == 1 else "are"
-    exact_frames = format_count(exact, "predicted frame")
     best = min(scenarios, key=lambda scenario: scenario.shift_gain)
-    is_independent = any(s.autocorrelation < AUTOCORRELATION for s in scenarios)
-    is_reset = any(s.drop < DROP for s in scenarios)
-    is_shifted = any(s.shift_gain < SHIFT_GAIN for s in scenarios)
-    is_bounded = any(s.growth < GROWTH and s.steps < 1.0 for s in scenarios)
-
     reasons = {
-        f"{exact_frames} {verb} the truth, bit for bit": exact > 0,
-        "the error of a frame does not follow from that of the frame before": (
-            is_independent
+        f"predicted frames that are the truth, bit for bit: {exact}": exact > 0,
+        "the error of a frame does not follow from that of the frame before": any(
+            one.autocorrelation < AUTOCORRELATION for one in scenarios
         ),
-        "the error drops within one frame": is_reset,
-        "a shift in time removes most of the error": is_shifted,
-        "the error stays within one frame's motion and does not accumulate": is_bounded,
+        "the error drops within one frame": any(one.drop < DROP for one in scenarios),
+        "a shift in time removes most of the error": best.shift_gain < SHIFT_GAIN,
+        "the error stays within one frame's motion and does not accumulate": any(
+            one.growth < GROWTH and one.steps < 1.0 for one in scenarios
+        ),
     }
     evidence = {
         "exact_frames": float(exact),
-        "error_autocorrelation": _least(s.autocorrelation for s in scenarios),
-        "error_drop": _least(s.drop for s in scenarios),
+        "error_autocorrelation": _least(one.autocorrelation for one in scenarios),
+        "error_drop": _least(one.drop for one in scenarios),
         "best_shift": float(best.shift),
         "shift_gain": best.shift_gain,
-        "error_growth": _least(s.growth for s in scenarios),
-        "error_in_steps": max(s.steps for s in scenarios),
+        "error_growth": _least(one.growth for one in scenarios),
+        "error_in_steps": max(one.steps for one in scenarios),
     }
     return _make_flag("copy_suspect", reasons, evidence)
 
@@ -274,9 +241,7 @@ def judge_predictability(
     """
     name = "below_twin_floor"
     if len(limit) != len(error):
-        reason = "no predictability limit is recorded"
-        if len(limit):
-            reason = "no predictability limit of these frames is recorded"
+        reason = "no predictability limit of these frames is recorded"
         return Flag(name=name, raised=None, reasons=(reason,), evidence={})
 
     perturbed = np.asarray(limit, np.float64)
@@ -290,9 +255,7 @@ def judge_predictability(
     if not is_compared.any():
         reason = "the perturbed run has lost the truth in all frames"
         return Flag(name=name, raised=None, reasons=(reason,), evidence=evidence)
-    verb = "is" if count == 1 else "are"
-    frames = format_count(count, "frame")
-    reason = f"{frames} {verb} closer to the truth than the perturbed run"
+    reason = f"frames closer to the truth than the perturbed run: {count}"
     return _make_flag(name, {reason: count > 0}, evidence)
 
 
@@ -311,19 +274,15 @@ def judge_physics(traces: Sequence[Trace], *, dimension: int = 2) -> Flag:
 
     extent = "area" if dimension == 2 else "volume"
     reasons = {
-        f"{energy:.2g} times the truth's kinetic energy": _is_beyond(energy, ENERGY),
+        f"{energy:.2g} times the truth's kinetic energy": (
+            energy < ENERGY[0] or energy > ENERGY[1]
+        ),
         f"the particles fill {occupancy:.2g} times the truth's {extent}": (
-            _is_beyond(occupancy, OCCUPANCY)
+            occupancy < OCCUPANCY[0] or occupancy > OCCUPANCY[1]
         ),
     }
     evidence = {"energy": energy, "occupancy": occupancy, "outside": outside}
     return _make_flag("physics", reasons, evidence)
-
-
-def _is_beyond(value: float, limits: tuple[float, float]) -> bool:
-    """Return whether a value lies outside of a range; False for NaN."""
-    low, high = limits
-    return value < low or value > high
 
 
 def _least(values: Iterable[float]) -> float:

@@ -23,10 +23,11 @@ import enum
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from lagbench.data.registry import Size
+from lagbench.data.checksums import round_digits
 from lagbench.metrics.aggregate import (
     FEWEST_FOR_INTERVAL,
     LEVEL,
@@ -45,6 +46,15 @@ CLASSICAL_SIDE = ("classical", "calibrated")
 
 LEAST_ERROR = 1e-12
 """A smaller error counts as this one: the logarithm of 0 has no place on the hull."""
+
+
+def digits(value: float) -> float | None:
+    """Return a number with nine significant digits, None where it is not finite.
+
+    >>> digits(2 / 3)
+    0.666666667
+    """
+    return round_digits(value) if math.isfinite(value) else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,15 +109,6 @@ def front_row(
         seconds=math.nan if seconds is None else seconds,
         errors=np.array(errors),
     )
-
-
-def best_naive(rows: Sequence[FrontRow]) -> FrontRow | None:
-    """Return the naive row with the least error; None without one."""
-    naive = []
-    for row in rows:
-        if row.kind == "naive" and not math.isnan(row.error):
-            naive.append(row)
-    return min(naive, key=lambda row: row.error, default=None)
 
 
 def classical_hull(rows: Sequence[FrontRow]) -> list[FrontRow]:
@@ -201,6 +202,15 @@ class Speedup:
     def pays(self) -> bool:
         """Whether the whole interval is above 1: learning pays here."""
         return self.interval[0] > 1.0
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the speedup as plain values; undefined ones are None."""
+        return {
+            "value": digits(self.value),
+            "interval": [digits(bound) for bound in self.interval],
+            "at_least": self.at_least,
+            "classical_seconds": digits(self.classical_seconds),
+        }
 
     def __str__(self) -> str:
         """Return sign, value and interval (where there is one), as in a table."""
@@ -328,14 +338,6 @@ def pays_after_holm(speedups: Mapping[str, Speedup]) -> list[str]:
         if speedup.pays and p < SIGNIFICANCE:
             pays.append(name)
     return pays
-
-
-def generation_hours(size: Size, solver_seconds: float) -> float:
-    """Return the processor time to generate train [h], that of a frame given [s]."""
-    frames = 0
-    for scenario in size.subsets["train"]:
-        frames += size.frame_count(scenario)
-    return solver_seconds * frames / 3600.0
 
 
 def breakeven(

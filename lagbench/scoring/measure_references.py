@@ -5,19 +5,16 @@ usage: python -m lagbench.scoring.measure_references [--split cavity] [--size mi
            [--costs]
 
 All splits and sizes whose data are there are measured on test, or those named, or on
-another subset, which then must be there. With --predictor
-only these references are measured anew, from the start; the others, and all costs, stay
-as they are. Without it each measured scenario is saved under the root folder: an
-interrupted run continues where it stopped. Last a frame of each reference and of the
-solver itself (``lagbench bench``) is timed on one core; with --costs nothing
-else is done. ``git diff`` then shows which shipped scores have changed.
+another subset, which then must be there. With --predictor only these references are
+measured anew; the others, and all costs, stay as they are. Last a frame of each
+reference and of the solver itself (``lagbench bench``) is timed on one core; with
+--costs nothing else is done. ``git diff`` then shows which shipped scores have changed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Collection, Sequence
@@ -35,7 +32,7 @@ from lagbench.references.shipped import (
 )
 from lagbench.references.table import REFERENCES, references_of
 
-from .references import measure, saved_folder, sizes_with_test_files, time_references
+from .references import measure, sizes_with_test_files, time_references
 from .task import load_scored_task
 
 
@@ -65,27 +62,21 @@ def measure_and_ship(
     if names is not None:
         names_here = {reference.name for reference in references_of(size)}
         if names_here.isdisjoint(names):
-            raise UsageError(
-                "the data set has no such reference", where=where, got=names
-            )
+            raise UsageError(f"none of its references: {', '.join(names)}", where=where)
     if size.measured is None:
         raise DataError("the data set has no recorded hash", where=where)
 
     config = load_scored_task(size, root).config
     reported = config.slow_frames.intersection(config.predicted_frames)
-    is_complete = names is None
-    scores = measure(size, root, names=names, workers=workers, resume=is_complete)
-    path = write_shipped(
+    scores = measure(size, root, names=names, workers=workers)
+    return write_shipped(
         size,
         scores,
         dataset_sha256=size.measured.dataset_sha256,
         reported=sorted(reported),
         folder=folder,
-        partial=not is_complete,
+        partial=names is not None,
     )
-    if is_complete:
-        shutil.rmtree(saved_folder(size, root))
-    return path
 
 
 def time_all(size: Size, root: Path, *, folder: Path = FOLDER) -> Path:
@@ -99,7 +90,7 @@ def time_all(size: Size, root: Path, *, folder: Path = FOLDER) -> Path:
     process = subprocess.run(command, capture_output=True, text=True, check=False)
     if process.returncode != 0:
         raise WorkFailedError(
-            "the solver could not be timed", got=process.stderr.strip()[-300:]
+            f"the solver could not be timed: {process.stderr.strip()[-300:]}"
         )
     solver = json.loads(process.stdout)["seconds_per_frame"]
     seconds = time_references(size, root)

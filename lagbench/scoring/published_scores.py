@@ -1,4 +1,4 @@
-"""Scores read from a scores.json, which may come from anybody: checked before use."""
+"""Scores read from a scores.json or scores.nc, which may come from anybody."""
 
 from __future__ import annotations
 
@@ -6,25 +6,22 @@ import itertools
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from lagbench.data.checksums import round_digits
 from lagbench.data.field_errors import describe_faults
-from lagbench.errors import UnreadableFileError, check_regular
+from lagbench.errors import check_regular
 from lagbench.metrics.aggregate import LARGEST, Score
-from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
-from lagbench.submission.format import MAX_NAME, require_name
+from lagbench.submission.format import IDENTITY, Name
 
-FORMAT = 1
-"""Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
-
-IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
-"""Fields that identify the predicted data set and the method."""
+from .score_file import read_statistics, unreadable_scores
+from .task import SUBMISSION
 
 MAX_BYTES = 64 << 20
 """Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
@@ -33,21 +30,12 @@ LARGEST_IN_FILE = float(f"{LARGEST:.9g}")
 """Largest value of a score, as rounded in the file."""
 
 
-def _require_known_format(number: int) -> int:
-    if number != FORMAT:
-        raise ValueError(f"layout {number}, not {FORMAT}")
-    return number
-
-
 def _require_ascending(ids: list[int]) -> list[int]:
-    if not ids:
-        raise ValueError("no scenario ids")
-    if not all(first < second for first, second in itertools.pairwise(ids)):
-        raise ValueError("scenario ids that do not ascend")
+    if not ids or not all(first < second for first, second in itertools.pairwise(ids)):
+        raise ValueError("scenario ids that do not ascend, or none")
     return ids
 
 
-Text = Annotated[str, AfterValidator(require_name)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Value = Annotated[float, Field(ge=-LARGEST_IN_FILE, le=LARGEST_IN_FILE)]
 
@@ -68,15 +56,15 @@ class _ScoreContent(_Content):
 
 
 class _ScoresContent(_Content):
-    lagbench_scores: Annotated[int, AfterValidator(_require_known_format)]
-    split: Text
-    size: Text
-    dataset_version: Text
-    dataset_sha256: Text
-    method: Text
-    subset: Text = "test"  # absent where it is test
-    predictions_sha256: Text
-    ranking_metric: Text
+    lagbench_scores: Literal[1]
+    split: Name
+    size: Name
+    dataset_version: Name
+    dataset_sha256: Name
+    method: Name
+    subset: Name = "test"  # absent where it is test
+    predictions_sha256: Name
+    ranking_metric: Name
     task: _TaskContent
     rows: dict[str, dict[str, _ScoreContent]]  # by row and metric
 
@@ -90,7 +78,7 @@ class PublishedScores:
     subset: str  # subset that was predicted
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
-    # scores by row and metric, over the horizon; values per frame are not in the file
+    # scores by row and metric, over the horizon, without values per frame
     scores: Mapping[str, Mapping[str, Score]]
 
 
@@ -103,10 +91,7 @@ def read_scores(path: Path) -> PublishedScores:
     check_regular(path, longest=MAX_BYTES, fix="`lagbench score` writes it")
     try:
         return parse_scores(json.loads(path.read_bytes()))
-    except (OSError, ValueError, TypeError) as error:
-        raise unreadable_scores(path, error) from error
-    except RecursionError as error:
-        # its own trace is a thousand frames long and says no more
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise unreadable_scores(path, error) from None
 
 
@@ -122,20 +107,27 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
         raise ValueError(describe_faults(error)) from error
 
     metrics = available()
-    rows = {}
+    ids = checked.task.scenarios
+    rows: dict[str, dict[str, Score]] = {}
     for row, scores in checked.rows.items():
-        row_scores = {}
+        rows[row] = {}
         for name, score in scores.items():
+            if not len(score.values) == len(score.undefined) == len(ids):
+                raise ValueError(f"{name}: not one value for each of {len(ids)} ids")
             if name in metrics:
-                row_scores[name] = _make_score(
-                    metrics[name], checked.task.scenarios, score
+                values = [
+                    math.nan if value is None else value for value in score.values
+                ]
+                rows[row][name] = Score(
+                    metric=metrics[name],
+                    scenarios=tuple(ids),
+                    frames=(),
+                    per_frame=np.empty((len(ids), 0)),
+                    values=np.array(values, np.float64),
+                    undefined=tuple(score.undefined),
                 )
-        rows[row] = row_scores
-    identity = {}
-    for name in IDENTITY:
-        identity[name] = getattr(checked, name)
     return PublishedScores(
-        identity=identity,
+        identity={name: getattr(checked, name) for name in IDENTITY},
         subset=checked.subset,
         predictions_sha256=checked.predictions_sha256,
         ranking=checked.ranking_metric,
@@ -143,32 +135,30 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
     )
 
 
-def _make_score(metric: Metric, ids: list[int], content: _ScoreContent) -> Score:
-    """Return the score of a metric, without values per frame."""
-    for numbers in (content.values, content.undefined):
-        if len(numbers) != len(ids):
-            raise ValueError(
-                f"{metric.name}: {len(numbers)} values of {len(ids)} scenarios"
-            )
-    values = []
-    for value in content.values:
-        values.append(math.nan if value is None else value)
-    return Score(
-        metric=metric,
-        scenarios=tuple(ids),
-        frames=(),
-        per_frame=np.empty((len(ids), 0)),
-        values=np.array(values, np.float64),
-        undefined=tuple(content.undefined),
-    )
+def read_published_scores(path: Path) -> PublishedScores:
+    """Return the scores of a scores.nc in the form of scores.json, with its digits.
 
+    The only reference is the best one, and it has the ranking metric only.
 
-def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
-    """Return the error for a file that is no scores.json or scores.nc."""
-    return UnreadableFileError(
-        f"not a scores{path.suffix} of lagbench",
-        where=str(path),
-        expected="what `lagbench score` writes beside the predictions",
-        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
-        fix="score the predictions again: lagbench score predictions.nc",
+    Raises:
+        UnreadableFileError: it is no scores.nc.
+    """
+    statistics = read_statistics(path)
+    submission: dict[str, Score] = {}
+    for name, score in statistics.scores().items():
+        values = [round_digits(value) for value in score.values.tolist()]
+        submission[name] = replace(score, values=np.array(values))
+
+    rows = {SUBMISSION: submission}
+    ranking = statistics.ranking
+    if statistics.best_reference is not None and ranking in submission:
+        values = statistics.best_reference_values
+        reference = replace(submission[ranking], values=values)
+        rows[statistics.best_reference] = {ranking: reference}
+    return PublishedScores(
+        identity=statistics.identity,
+        subset=statistics.subset,
+        predictions_sha256=statistics.predictions_sha256,
+        ranking=ranking,
+        scores=rows,
     )

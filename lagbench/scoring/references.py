@@ -2,8 +2,6 @@
 
 :func:`measure` produces the shipped ones
 (``python -m lagbench.scoring.measure_references``), and they are checked against it.
-With ``resume`` each measured scenario is saved under the root folder, so that an
-interrupted measurement continues where it stopped.
 """
 
 from __future__ import annotations
@@ -16,28 +14,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.atomic import atomic_path
 from lagbench.data.layout import has_file
 from lagbench.data.local import check_contents
 from lagbench.data.registry import Registry, Size, load
-from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.aggregate import Tally, aggregate
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import METRICS, select
-from lagbench.references.predictor import ReferencePredictor, given_in
+from lagbench.references.predictor import given_in
 from lagbench.references.shipped import ReferenceScores, correlation_of
 from lagbench.references.table import REFERENCES, references_of
 from lagbench.store.copy import update_working_copy
 from lagbench.work.executor import Report
 from lagbench.work.run import Meter, Progress, run_all
 
-from .scenario import measure_rows, predict_reference
-from .task import ScoredTask, load_scored_task
+from .task import ScoredTask, load_scored_task, measure_rows, predict_reference
 
 TIMED_SCENARIOS = 2
 """Test scenarios on which the references are timed."""
-
-TOLERANCE = 1e-4
-"""Relative difference of equal values: libraries round differently."""
 
 
 def measurable(size: Size, root: Path) -> tuple[str, ...]:
@@ -45,8 +38,12 @@ def measurable(size: Size, root: Path) -> tuple[str, ...]:
 
     These are the ones that count.
     """
-    references = _with_data(size, root)
-    return tuple(reference.name for reference in references if reference.counts)
+    has_train = _has_files(size, root, "train")
+    names = []
+    for reference in references_of(size):
+        if reference.counts and (has_train or not reference.reads_train):
+            names.append(reference.name)
+    return tuple(names)
 
 
 def check_train(size: Size, root: Path, references: Collection[str]) -> None:
@@ -59,18 +56,6 @@ def check_train(size: Size, root: Path, references: Collection[str]) -> None:
         scenarios = size.subsets["train"]
         update_working_copy(size, root, scenarios)
         check_contents(size, root, scenarios)
-
-
-def _with_data(size: Size, root: Path) -> list[ReferencePredictor]:
-    """Return the references of a size; those that read train only if it is there."""
-    references = references_of(size)
-    if _has_files(size, root, "train"):
-        return list(references)
-    usable_references = []
-    for reference in references:
-        if not reference.reads_train:
-            usable_references.append(reference)
-    return usable_references
 
 
 def _has_files(size: Size, root: Path, subset: str) -> bool:
@@ -91,8 +76,8 @@ def sizes_with_test_files(
     Args:
         root: folder of all data sets.
         split: the only split.
-        name: the only size, of the splits that have it; with a split it is returned
-            whether its files are there or not.
+        name: the only size; with a split it is returned whether its files are there or
+            not.
         registry: the splits; ours when None.
 
     Raises:
@@ -100,35 +85,15 @@ def sizes_with_test_files(
     """
     if registry is None:
         registry = load()
-    sizes = []
-    for one_split in _choose_splits(registry, split, name):
-        names = [name] if name else list(registry.split(one_split).sizes)
-        for one_name in names:
-            sizes.append(registry.size(one_split, one_name))
     if split and name:
-        return sizes
-    sizes_with_data = []
-    for size in sizes:
-        if _has_files(size, root, "test"):
-            sizes_with_data.append(size)
-    return sizes_with_data
-
-
-def _choose_splits(
-    registry: Registry, split: str | None, name: str | None
-) -> list[str]:
-    """Return the named split; else those that have a size of the name."""
-    if split:
-        return [split]
-    every = list(registry.splits)
-    if not name:
-        return every
-    chosen = []
-    for one_split in every:
-        if name in registry.split(one_split).sizes:
-            chosen.append(one_split)
-    # a name that no split has is refused where the first one is looked up
-    return chosen or every
+        return [registry.size(split, name)]
+    sizes = []
+    for one_split in [split] if split else registry.splits:
+        for one_name in registry.split(one_split).sizes:
+            size = registry.size(one_split, one_name)
+            if name in (None, one_name) and _has_files(size, root, "test"):
+                sizes.append(size)
+    return sizes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +103,6 @@ class ReferenceJob:
     task: ScoredTask  # the subset that is scored
     scenario: int  # id of the scenario
     references: tuple[str, ...]  # their names
-    metrics: tuple[str, ...]  # names of the metrics
-    saved: Path | None = None  # file of the result of an earlier run, or for this one
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,21 +111,12 @@ class ReferenceTallies:
 
     scenario: int  # id of the scenario
     tallies: Mapping[str, Tally]  # statistics by name of the reference
-    # CPU time of the prediction, median over frames [s]
-    seconds_per_frame: Mapping[str, float]
+    # CPU time of the prediction of each frame by name of the reference [s]
+    seconds: Mapping[str, list[float]]
 
 
 def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
-    """Measure the references on one scenario, or read the result of an earlier run.
-
-    A result of other references does not count.
-    """
-    if job.saved is not None and job.saved.is_file():
-        earlier = _load(job.scenario, job.saved)
-        if earlier.tallies.keys() == set(job.references):
-            report(job.task.config.horizon)
-            return earlier
-
+    """Measure the references on one scenario."""
     seconds: dict[str, list[float]] = {name: [] for name in job.references}
     with job.task.opened(job.scenario) as truth:
         given = given_in(truth.file, job.task.size, job.task.truth.root)
@@ -175,17 +129,10 @@ def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
             truth.scenario,
             truth.snapshots(),
             rows,
-            metrics=select(job.metrics),
+            metrics=select(known=METRICS),
             report=report,
         )
-
-    medians = {}
-    for name in seconds:
-        medians[name] = float(np.median(seconds[name]))
-    result = ReferenceTallies(job.scenario, tallies, medians)
-    if job.saved is not None:
-        _save(result, job.saved)
-    return result
+    return ReferenceTallies(job.scenario, tallies, seconds)
 
 
 def time_references(size: Size, root: Path) -> dict[str, float]:
@@ -218,58 +165,12 @@ def _time_frames(
         yield frame
 
 
-def _save(result: ReferenceTallies, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tallies = list(result.tallies.values())
-    with atomic_path(path, option="--root") as temporary, open(temporary, "wb") as file:
-        np.savez(
-            file,
-            floors=list(result.tallies),
-            names=tallies[0].names,
-            frames=tallies[0].frames,
-            total=[tally.total for tally in tallies],
-            weight=[tally.weight for tally in tallies],
-            undefined=[tally.undefined for tally in tallies],
-            seconds_per_frame=list(result.seconds_per_frame.values()),
-        )
-
-
-def _load(scenario: int, path: Path) -> ReferenceTallies:
-    with np.load(path, allow_pickle=False) as arrays:
-        references = arrays["floors"].tolist()
-        names = tuple(arrays["names"].tolist())
-        frames = tuple(arrays["frames"].tolist())
-        seconds = arrays["seconds_per_frame"].tolist()
-        totals = arrays["total"]
-        weights = arrays["weight"]
-        undefined = arrays["undefined"]
-
-    tallies = {}
-    for i, reference in enumerate(references):
-        tallies[reference] = Tally(names, frames, totals[i], weights[i], undefined[i])
-    return ReferenceTallies(
-        scenario, tallies, dict(zip(references, seconds, strict=True))
-    )
-
-
-def saved_folder(size: Size, root: Path) -> Path:
-    """Return the folder in which an interrupted measurement of a data set is saved."""
-    sha256 = "unrecorded"
-    if size.measured:
-        sha256 = size.measured.dataset_sha256
-    name = f"{size.split}-{size.name}"
-    if size.scored_subset != "test":
-        name += f"-{size.scored_subset}"
-    return root / ".floors" / f"{name}-{sha256[:16]}"
-
-
 def measure(
     size: Size,
     root: Path,
     *,
     names: Collection[str] | None = None,
     workers: int = 1,
-    resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> dict[str, ReferenceScores]:
     """Return the scores of references of a data set by name.
@@ -282,30 +183,18 @@ def measure(
         root: folder of all data sets.
         names: names of the references; by default all.
         workers: worker processes.
-        resume: whether each scenario is saved under the root, and read if it was saved
-            by an earlier run.
         progress: called with the state of the work.
     """
     task = load_scored_task(size, root)
     metrics = select(known=METRICS)
-    names_to_measure = []
-    for reference in references_of(size):
-        if names is None or reference.name in names:
-            names_to_measure.append(reference.name)
-    references = tuple(names_to_measure)
+    references = tuple(
+        one.name for one in references_of(size) if names is None or one.name in names
+    )
     check_train(size, root, references)
-    folder = saved_folder(size, root)
     jobs = {}
     for scenario in task.scenarios:
-        saved = None
-        if resume:
-            saved = folder / f"{scenario:04d}.npz"
         jobs[f"references on scenario {scenario}"] = ReferenceJob(
-            task=task,
-            scenario=scenario,
-            references=references,
-            metrics=tuple(metric.name for metric in metrics),
-            saved=saved,
+            task=task, scenario=scenario, references=references
         )
 
     meter = Meter(progress)
@@ -318,53 +207,13 @@ def measure(
 
     measured = {}
     for name in references:
-        tallies = {}
-        for result in results:
-            tallies[result.scenario] = result.tallies[name]
+        tallies = {result.scenario: result.tallies[name] for result in results}
         scores = aggregate(metrics, tallies)
-        seconds = []
-        for result in results:
-            seconds.append(result.seconds_per_frame[name])
+        medians = [np.median(result.seconds[name]) for result in results]
         measured[name] = ReferenceScores(
             name=name,
             scores=scores,
-            seconds_per_frame=float(np.median(seconds)),
+            seconds_per_frame=float(np.median(medians)),
             correlation=correlation_of(scores),
         )
     return measured
-
-
-def differences(
-    expected: Mapping[str, ReferenceScores], measured: Mapping[str, ReferenceScores]
-) -> dict[str, tuple[str, ...]]:
-    """Return by reference the metrics whose values per scenario differ.
-
-    A metric that only one of the two has differs.
-    """
-    unequal = {}
-    for name in {**expected, **measured}:
-        before = _scores_of(expected, name)
-        after = _scores_of(measured, name)
-        metrics = []
-        for metric in {**before, **after}:
-            if not _are_equal(before.get(metric), after.get(metric)):
-                metrics.append(metric)
-        if metrics:
-            unequal[name] = tuple(metrics)
-    return unequal
-
-
-def _scores_of(
-    references: Mapping[str, ReferenceScores], name: str
-) -> Mapping[str, Score]:
-    if name in references:
-        return references[name].scores
-    return {}
-
-
-def _are_equal(before: Score | None, after: Score | None) -> bool:
-    if before is None or after is None:
-        return False
-    return np.allclose(
-        before.values, after.values, rtol=TOLERANCE, atol=1e-12, equal_nan=True
-    )

@@ -37,52 +37,35 @@ def few_nodes_warning(task: ScoredTask, scenarios: Collection[int]) -> Validatio
         first, _ = _clouds(task, scenario)
         counts.append(covered_nodes(first, grid))
 
-    least = min(counts)
-    most = max(counts)
-    nodes = str(least)
-    if most > least:
-        nodes = f"{least} to {most}"
     return ValidationIssue(
         check="undefined",
         severity=Severity.WARNING,
-        what="the vorticity has no value in any frame",
+        what=f"the vorticity has no value in any frame of {len(counts)} of "
+        f"{len(task.scenarios)} {task.truth.subset} scenarios: {min(counts)} to "
+        f"{max(counts)} nodes counted, {MINIMUM_NODES} needed; {_suggest_grid(task)}",
         where=f"score grid of {grid.cells} cells",
-        expected=f"{MINIMUM_NODES} nodes with particles enough around them",
-        got=f"{len(counts)} of {len(task.scenarios)} {task.truth.subset} scenarios "
-        f"undefined: {nodes} nodes counted, {MINIMUM_NODES} needed",
-        fix=_suggest_grid(task),
     )
 
 
 def _suggest_grid(task: ScoredTask) -> str:
     """Return the hint that names a grid of which all scenarios cover enough nodes."""
     grid = task.config.grid
-    cells = fitting_cells(
-        lambda: _all_clouds(task), grid.placement, near=grid.cells, box=grid.box
-    )
-    longest_side = float(max(grid.box.lengths))
-    if cells is None and longest_side < SMALL_SIDE:
-        return (
-            f"lengths in another unit: the longest side of the box is "
-            f"{longest_side:.2g}; import the data anew, which scales them"
-        )
-    if cells is None:
-        return "more particles: they cover enough nodes of no grid"
 
-    word = "finer"
-    if cells < grid.cells:
-        word = "coarser"
+    def clouds() -> Iterator[Cloud]:
+        for scenario in task.scenarios:
+            yield from _clouds(task, scenario)
+
+    cells = fitting_cells(clouds, grid.placement, near=grid.cells, box=grid.box)
+    if cells is None and max(grid.box.lengths) < SMALL_SIDE:
+        return "import the data in another unit of length: the box is small"
+    if cells is None:
+        return "more particles are needed: they cover enough nodes of no grid"
     # no path of this machine: scores.json repeats it
     description = Path(task.size.split) / DESCRIPTION
-    is_local = (task.truth.root / description).is_file()
-    if not is_local:
-        return f"a {word} grid: {cells} cells"
-    return f"a {word} grid: cells: {cells} under score_grid in {description.as_posix()}"
-
-
-def _all_clouds(task: ScoredTask) -> Iterator[Cloud]:
-    for scenario in task.scenarios:
-        yield from _clouds(task, scenario)
+    place = ""
+    if (task.truth.root / description).is_file():
+        place = f", under score_grid in {description.as_posix()}"
+    return f"take a grid of {cells} cells{place}"
 
 
 def _clouds(task: ScoredTask, scenario: int) -> tuple[Cloud, Cloud]:
@@ -108,45 +91,27 @@ def check_scorability(
         root: folder of all data sets.
         validated: whether the valid subset is used too, to validate a training.
     """
-    subsets = ["test"]
-    if validated:
-        subsets.append("valid")
-
-    for subset in subsets:
+    for subset in ("test", "valid") if validated else ("test",):
         try:
             task = load_scored_task(size, root, subset=subset)
-            yield from _check_subset(task)
+            moves = False
+            sparse = []  # scenarios with too few covered nodes
+            for scenario in task.scenarios:
+                with task.opened(scenario) as opened:
+                    before = opened.scenario.initial_snapshot.position
+                covered = []
+                for cloud in _clouds(task, scenario):
+                    moves |= not np.array_equal(before, cloud.position)
+                    covered.append(covered_nodes(cloud, task.config.grid))
+                if max(covered) < MINIMUM_NODES:
+                    sparse.append(scenario)
+            if not moves:
+                yield (
+                    f"nothing moves in {subset}: no reference has an error to be "
+                    "better than; import other trajectories for it"
+                )
+            elif sparse and ranking_metric(task.size) == OF_NODES:
+                yield few_nodes_warning(task, sparse).what
         except LagbenchError as error:
             # the training itself may do without the missing files
-            fix = ""
-            if error.fix:
-                fix = f"; {error.fix}"
-            yield f"{error.what}: expected {error.expected}, got {error.got}{fix}"
-
-
-def _check_subset(task: ScoredTask) -> Iterator[str]:
-    """Yield reasons why predictions of a subset could not be scored."""
-    subset = task.truth.subset
-    moves = False
-    sparse = []  # scenarios with too few covered nodes
-    for scenario in task.scenarios:
-        with task.opened(scenario) as opened:
-            before = opened.scenario.initial_snapshot.position
-        clouds = _clouds(task, scenario)
-
-        covered = []
-        for cloud in clouds:
-            moves |= not np.array_equal(before, cloud.position)
-            covered.append(covered_nodes(cloud, task.config.grid))
-        if max(covered) < MINIMUM_NODES:
-            sparse.append(scenario)
-
-    if not moves:
-        yield (
-            f"nothing moves in {subset}: no reference has an error to be better than; "
-            f"other trajectories for {subset}: lagbench import with folders train, "
-            f"valid and test"
-        )
-    elif sparse and ranking_metric(task.size) == OF_NODES:
-        warning = few_nodes_warning(task, sparse)
-        yield f"{warning.got}; {warning.fix}"
+            yield str(error)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+import itertools
+import json
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.layout import expand_home
@@ -20,13 +20,7 @@ from lagbench.data.local import (
     resolve_root,
 )
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import (
-    LagbenchError,
-    UnreadableFileError,
-    UsageError,
-    check_installed,
-    suggest_name,
-)
+from lagbench.errors import LagbenchError, UsageError, check_installed, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.metric import Metric
@@ -38,20 +32,20 @@ from lagbench.metrics.table import (
     ranking_metric,
     select,
 )
-from lagbench.references import extrapolation
+from lagbench.references.extrapolation import PERSISTENCE
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
 from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
-from lagbench.submission.predictions import Predictions, open_predictions
+from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import require_split, validate
 from lagbench.work.executor import Report
 from lagbench.work.machine import available_cores, worker_count
 from lagbench.work.run import Meter, Progress, run_all
 
 from .card import JSON_NAME, ScoreCard, format_scores
-from .flags import Flag, Trace, judge_copying, judge_physics, judge_predictability
+from .flags import Trace, judge_copying, judge_physics, judge_predictability
 from .front import (
     NoSpeedup,
     Speedup,
@@ -59,20 +53,17 @@ from .front import (
     front_row,
     seconds_where_measured,
 )
-from .published_scores import IDENTITY, read_scores
 from .references import check_train, measurable
-from .scenario import (
+from .scorability import OF_NODES, few_nodes_warning
+from .score_file import NETCDF_NAME, write_statistics
+from .skill import compute_skill
+from .task import (
     SUBMISSION,
-    Preview,
-    PreviewRecorder,
+    ScoredTask,
+    load_scored_task,
     measure_rows,
     predict_reference,
 )
-from .scorability import OF_NODES, few_nodes_warning
-from .score_file import NETCDF_NAME
-from .score_file_writer import write_statistics
-from .skill import compute_skill
-from .task import ScoredTask, load_scored_task
 
 WORTH_WORKERS = 1_000_000
 """Least particles times predicted frames for which worker processes are worth it."""
@@ -136,12 +127,19 @@ def score(
             failed.
     """
     own = own_metrics(metrics)
+    if own and (scheduler is not None or (workers or 1) > 1):
+        raise UsageError(
+            "metrics of your own are measured in this process; leave workers and "
+            "scheduler out, or install the metrics as a package: docs/extending.md",
+            where="metrics",
+        )
     if own:
-        workers = _one_worker(workers, scheduler)
-    table = METRICS
-    if packages:
-        table = available()
-    measured_metrics = select((*_select_metrics(extras, table), *own), known=table)
+        workers = 1
+    if isinstance(extras, str):
+        extras = (extras,)
+    check_extras(extras)
+    table = available() if packages else METRICS
+    measured_metrics = select((*select(extras=extras, known=table), *own), known=table)
     given_path = expand_home(predictions, "predictions")
     path = given_path.absolute()
     expected_split = None
@@ -153,17 +151,15 @@ def score(
     if output_dir is not None:
         folder = expand_home(output_dir, "--output")
 
-    result = validated
-    if result is None:
-        result = validate(
-            path, root=data_root, require_truth=True, registry=rooted_registry
-        )
-    _require_validation_of(path, result)
+    result = validated or validate(
+        path, root=data_root, require_truth=True, registry=rooted_registry
+    )
+    if result.path != path:
+        raise UsageError("the validation is of another file; leave validated out")
     require_split(result, expected_split)
     if examined is not None:
         examined(result)
     result.check()
-
     with open_predictions(path) as opened:
         header = opened.header
         info = opened.info
@@ -185,122 +181,56 @@ def score(
         task,
         path,
         info,
-        metrics=_names_or_metrics(measured_metrics, {metric.name for metric in own}),
+        metrics=measured_metrics,
         references=references,
         workers=workers,
         scheduler=scheduler,
         meter=Meter(progress),
     )
     tallies: dict[str, dict[int, Tally]] = {}
-    for row in outcomes[0].tallies:
-        tallies[row] = {}
-        for outcome in outcomes:
-            tallies[row][outcome.scenario] = outcome.tallies[row]
     scores: dict[str, Mapping[str, Score]] = {}
-    for row, row_tallies in tallies.items():
-        scores[row] = aggregate(measured_metrics, row_tallies)
-    measurement = Measurement(outcomes=outcomes, tallies=tallies, scores=scores)
-    card = _make_card(
-        measurement,
-        task=task,
-        header=header,
-        sha256=sha256,
-        shipped_references=shipped_references,
-        warnings=result.warnings,
-    )
-    if write:
-        return _write(card, folder)
-    return card
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Measurement:
-    """What was measured of a submission and of the references beside it."""
-
-    outcomes: Sequence[ScenarioScores]  # by ascending id of the scenario
-    tallies: Mapping[str, Mapping[int, Tally]]  # statistics by row and scenario
-    scores: Mapping[str, Mapping[str, Score]]  # by row and metric
-
-
-def _one_worker(workers: int | None, scheduler: str | None) -> int:
-    """Return the number of workers for functions that no other process can import.
-
-    Raises:
-        UsageError: more of them are asked for.
-    """
-    if scheduler is not None or (workers or 1) > 1:
-        got = f"workers={workers}"
-        if scheduler is not None:
-            got = f"scheduler={scheduler!r}"
-        raise UsageError(
-            "metrics of your own are measured in this process",
-            where="metrics",
-            expected="one worker and no scheduler",
-            got=got,
-            fix="leave it out, or install the metrics as a package: see "
-            "docs/extending.md",
-        )
-    return 1
-
-
-def _names_or_metrics(
-    metrics: Sequence[Metric], own_names: Collection[str]
-) -> tuple[str | Metric, ...]:
-    """Return the names of installed metrics, and the others themselves."""
-    listed: list[str | Metric] = []
-    for metric in metrics:
-        listed.append(metric if metric.name in own_names else metric.name)
-    return tuple(listed)
-
-
-def _make_card(
-    measurement: Measurement,
-    *,
-    task: ScoredTask,
-    header: Header,
-    sha256: str,
-    shipped_references: Mapping[str, ReferenceScores],
-    warnings: Sequence[ValidationIssue],
-) -> ScoreCard:
-    """Return the score card: measured scores beside those of the references.
-
-    Args:
-        measurement: what was measured.
-        task: the test subset.
-        header: what the predictions say about themselves.
-        sha256: content hash of the predicted positions.
-        shipped_references: scores of the references that were not measured.
-        warnings: of the validation.
-    """
-    scores = dict(measurement.scores)
+    for row in outcomes[0].tallies:
+        tallies[row] = {one.scenario: one.tallies[row] for one in outcomes}
+        scores[row] = aggregate(measured_metrics, tallies[row])
     for name, reference in shipped_references.items():
         scores[name] = reference.scores
-    ranking = ranking_metric(task.size)
+
+    ranking = ranking_metric(size)
     submission = scores[SUBMISSION][ranking]
-    counting = {}
+    naive = {}
     for row, row_scores in scores.items():
         if row in NAIVE and ranking in row_scores:
-            counting[row] = row_scores[ranking]
-
-    speedup = speedup_beside(header, task.size, submission, shipped_references)
-    few_nodes = _warn_of_few_nodes(task, measurement.tallies[SUBMISSION])
-    return ScoreCard(
+            naive[row] = row_scores[ranking]
+    # position RMSE, mean over scenarios [length], shape [frame]
+    error, persistence_error = (
+        np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
+        for row in (SUBMISSION, PERSISTENCE.name)
+    )
+    traces = [outcome.trace for outcome in outcomes]
+    card = ScoreCard(
         header=header,
         predictions_sha256=sha256,
         config=task.config,
         ranking=ranking,
-        tallies=measurement.tallies,
+        tallies=tallies,
         scores=scores,
-        skill=compute_skill([submission], counting),
-        speedup=speedup,
-        flags=_judge(task, measurement.outcomes, scores),
-        warnings=(*warnings, *few_nodes),
-        preview=next(
-            outcome.preview
-            for outcome in measurement.outcomes
-            if outcome.preview is not None
+        skill=compute_skill([submission], naive),
+        speedup=speedup_beside(header, size, submission, shipped_references),
+        flags=(
+            judge_copying(traces),
+            judge_predictability(error, persistence_error, task.predictability_limit),
+            judge_physics(traces, dimension=size.dimension),
         ),
+        warnings=(*result.warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
     )
+    if not write:
+        return card
+    json_path = folder / JSON_NAME
+    # both files, or neither where the disk is full
+    with atomic_path(json_path, option="--output") as temporary:
+        temporary.write_bytes(format_scores(card))
+        write_statistics(card, folder / NETCDF_NAME)
+    return replace(card, files=(json_path, folder / NETCDF_NAME))
 
 
 def speedup_beside(
@@ -361,51 +291,25 @@ def scores_folder(predictions: Path) -> Path:
     return predictions.parent / f"{predictions.stem}-scores"
 
 
-def _require_validation_of(path: Path, result: ValidationResult) -> None:
-    """Refuse the result of a validation of another file."""
-    if result.path != path:
-        raise UsageError(
-            "the validation is of another file",
-            where=str(path),
-            expected="the result of validate for this file",
-            got=result.path,
-            fix="leave validated out: score validates by itself",
-        )
-
-
 def _check_overwriting(path: Path, header: Header) -> None:
-    """Refuse to write over scores of another method, data set or subset."""
-    if not path.exists():
-        return
-    identity = {}
-    for name in IDENTITY:
-        identity[name] = getattr(header, name)
-    expected = _describe_scored(identity, header.subset)
-    try:
-        scores = read_scores(path)
-        present = _describe_scored(scores.identity, scores.subset)
-    except UnreadableFileError:
-        present = "something else"
-    if present != expected:
-        raise UsageError(
-            "the folder holds the scores of another submission",
-            where=str(path),
-            expected=f"no such file, or the scores of {expected}",
-            got=present,
-            fix="name another folder for the new scores: --output FOLDER, in Python "
-            "output_dir=; or remove the old ones",
-        )
-
-
-def _describe_scored(identity: Mapping[str, str], subset: str) -> str:
-    """Return method, data set and subset of scores in words.
+    """Refuse to write over scores of another method, data set or subset.
 
     A minor version leaves the data as they are, so the hash decides.
     """
-    split = identity["split"]
-    size = identity["size"]
-    sha256 = identity["dataset_sha256"]
-    return f"{identity['method']} {split} {size} {subset}, data {sha256}"
+    if not path.exists():
+        return
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        content = {}
+    present = {"subset": "test", **content} if isinstance(content, dict) else {}
+    for name in ("method", "split", "size", "subset", "dataset_sha256"):
+        if present.get(name) != getattr(header, name):
+            raise UsageError(
+                f"the folder holds the scores of another {name}; write these to "
+                "another folder: --output FOLDER",
+                where=str(path),
+            )
 
 
 def _warn_of_few_nodes(
@@ -417,44 +321,14 @@ def _warn_of_few_nodes(
     """
     without = []
     for i, tally in tallies.items():
-        if not _has_nodes(tally):
+        is_compared = "vorticity_mse" not in tally.names or np.any(
+            tally.weight[tally.names.index("vorticity_mse")]
+        )
+        if not is_compared:
             without.append(i)
-    if not without:
-        return
-    if ranking_metric(task.size) == OF_NODES or len(without) == len(tallies):
+    ranks = ranking_metric(task.size) == OF_NODES
+    if without and (ranks or len(without) == len(tallies)):
         yield few_nodes_warning(task, without)
-
-
-def _has_nodes(tally: Tally) -> bool:
-    """Return whether the vorticity was compared in any frame, if it was measured."""
-    if "vorticity_mse" not in tally.names:
-        return True
-    row = tally.names.index("vorticity_mse")
-    return bool(tally.weight[row].any())
-
-
-def _write(card: ScoreCard, folder: Path) -> ScoreCard:
-    """Write both files and return the card with their paths."""
-    json_path = folder / JSON_NAME
-    netcdf_path = folder / NETCDF_NAME
-    # both, or neither where the disk is full
-    with atomic_path(json_path, option="--output") as temporary:
-        temporary.write_bytes(format_scores(card))
-        write_statistics(card, netcdf_path)
-    return card.at(json_path, netcdf_path)
-
-
-def _select_metrics(
-    extras: str | Collection[str], table: Mapping[str, Metric]
-) -> tuple[Metric, ...]:
-    """Return the metrics of a table to measure.
-
-    Extras are refused as by `check_extras`.
-    """
-    if isinstance(extras, str):
-        extras = (extras,)
-    check_extras(extras)
-    return select(extras=extras, known=table)
 
 
 def check_extras(extras: Collection[str]) -> None:
@@ -465,25 +339,16 @@ def check_extras(extras: Collection[str]) -> None:
     """
     modules: dict[str, set[str]] = {}
     for metric in available().values():
-        if metric.extra is None:
-            continue
-        modules_of_extra = modules.setdefault(metric.extra, set())
-        if metric.module is not None:
-            modules_of_extra.add(metric.module)
+        if metric.extra is not None:
+            modules.setdefault(metric.extra, set()).add(metric.module or "lagbench")
     for extra in extras:
         if extra not in modules:
             raise UsageError(
-                f"no extra {extra!r} with metrics",
+                f"no extra {extra!r} with metrics; {suggest_name(extra, modules)}",
                 where="--extras",
-                expected="an extra that brings metrics",
-                got=ascii(extra),
-                fix=suggest_name(extra, modules),
             )
         for module in sorted(modules[extra]):
             check_installed(module, extra=extra)
-
-
-# --- one scenario, the unit of parallel work ------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -494,10 +359,8 @@ class ScenarioJob:
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
     info: FileInfo  # content of its headers
-    # names of the metrics, and metrics of the user that are not installed
-    metrics: tuple[str | Metric, ...]
+    metrics: tuple[Metric, ...]
     references: tuple[str, ...] = ()  # names of the references to measure beside it
-    has_preview: bool = False  # whether to take the preview
 
 
 @dataclass(frozen=True, eq=False)
@@ -507,18 +370,11 @@ class ScenarioScores:
     scenario: int  # id of the scenario
     tallies: Mapping[str, Tally]  # statistics by row
     trace: Trace  # of the submission's error
-    preview: Preview | None  # pictures, if they were asked for
-
-
-# the search through installed packages takes as long as some frames
-_select = functools.cache(select)
 
 
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     """Score one scenario of a submission and of the references beside it."""
     number = job.scenario
-    metrics = _select(job.metrics)
-    recorder = None
     try:
         with (
             job.task.opened(number) as truth,
@@ -526,7 +382,8 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
             ExitStack() as open_rows,
         ):
             scenario = truth.scenario
-            frames = _predicted_frames(predictions, number)
+            blocks = (block for _, block in predictions.blocks(number))
+            frames = itertools.chain.from_iterable(blocks)
             rows = {SUBMISSION: snapshots(scenario, frames)}
             for name in job.references:
                 given = given_in(truth.file, job.task.size, job.task.truth.root)
@@ -535,37 +392,13 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
                 if isinstance(prediction, Generator):
                     open_rows.callback(prediction.close)
                 rows[name] = snapshots(scenario, prediction)
-
-            if job.has_preview:
-                obstacle = truth.obstacle
-                recorder = PreviewRecorder(number, scenario, obstacle=obstacle)
             tallies, trace = measure_rows(
-                scenario,
-                truth.snapshots(),
-                rows,
-                metrics=metrics,
-                recorder=recorder,
-                report=report,
+                scenario, truth.snapshots(), rows, metrics=job.metrics, report=report
             )
     except LagbenchError as error:
         error.add_note(f"scenario {number}")
         raise
-
-    preview = None
-    if recorder is not None:
-        preview = recorder.preview
-    return ScenarioScores(number, tallies, trace, preview)
-
-
-def _predicted_frames(
-    predictions: Predictions, scenario: int
-) -> Iterator[NDArray[np.floating]]:
-    """Yield the predicted positions of one frame after the other."""
-    for _, block in predictions.blocks(scenario):
-        yield from block
-
-
-# --- all scenarios --------------------------------------------------------------------
+    return ScenarioScores(number, tallies, trace)
 
 
 def score_scenarios(
@@ -573,7 +406,7 @@ def score_scenarios(
     path: Path,
     info: FileInfo,
     *,
-    metrics: tuple[str | Metric, ...],
+    metrics: tuple[Metric, ...],
     references: tuple[str, ...],
     workers: int | None,
     scheduler: str | None,
@@ -585,7 +418,7 @@ def score_scenarios(
         task: the test subset.
         path: a predictions.nc that has been validated.
         info: content of its headers.
-        metrics: names of the metrics, and metrics that are not installed.
+        metrics: the metrics to measure.
         references: names of the references to measure beside it.
         workers: worker processes; None: one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
@@ -601,7 +434,6 @@ def score_scenarios(
             info=info,
             metrics=metrics,
             references=references,
-            has_preview=scenario == scenarios[0],
         )
 
     frame_count = len(scenarios) * task.config.horizon
@@ -615,23 +447,4 @@ def score_scenarios(
         workers=worker_count(workers, default=default),
         scheduler=scheduler,
         report=meter.count,
-    )
-
-
-def _judge(
-    task: ScoredTask,
-    outcomes: Sequence[ScenarioScores],
-    scores: Mapping[str, Mapping[str, Score]],
-) -> tuple[Flag, ...]:
-    """Return the flags of a submission."""
-    traces = [outcome.trace for outcome in outcomes]
-    # position RMSE, mean over scenarios [length], shape [frame]
-    submission = scores[SUBMISSION]["position_rmse"]
-    persistence = scores[extrapolation.PERSISTENCE.name]["position_rmse"]
-    error = np.asarray(np.mean(submission.per_frame, axis=0))
-    persistence_error = np.asarray(np.mean(persistence.per_frame, axis=0))
-    return (
-        judge_copying(traces),
-        judge_predictability(error, persistence_error, task.predictability_limit),
-        judge_physics(traces, dimension=task.size.dimension),
     )

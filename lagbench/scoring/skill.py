@@ -19,7 +19,6 @@ from lagbench.metrics.aggregate import (
     bootstrap_interval,
     mean_over_seeds,
 )
-from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction
 
 
@@ -49,16 +48,8 @@ def best_reference(references: Mapping[str, Score]) -> str | None:
     Less must be better. A mean of 0 or NaN does not count, because nothing can be
     divided by it.
     """
-    means = {}
-    for name, score in references.items():
-        means[name] = score.mean
-    positive = []
-    for name, mean in means.items():
-        if mean > 0.0:
-            positive.append(name)
-    if positive:
-        return min(positive, key=lambda name: means[name])
-    return None
+    positive = [name for name, score in references.items() if score.mean > 0.0]
+    return min(positive, key=lambda name: references[name].mean, default=None)
 
 
 def compute_skill(
@@ -66,7 +57,11 @@ def compute_skill(
 ) -> Skill | None:
     """Return the skill of a method over naive predictors in the same metric.
 
-    The interval never passes 1 (see :func:`_compute_ratio`).
+    The interval is that of the ratio of means r = A / B, by the linear part of its
+    logarithm: with e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the
+    score of seed s and b_i that of the reference in scenario i, it is r exp(e). So the
+    skill never passes 1, and is one point where the ratio is the same everywhere. Two
+    seeds say little: its lower end may lie far down.
 
     Args:
         seeds: score of each seed, over the same scenarios.
@@ -79,41 +74,13 @@ def compute_skill(
     name = best_reference(references)
     if name is None:
         return None
-    ratio = _compute_ratio(seeds, references[name])
-    if ratio is None:
-        return None
-    low, high = ratio.interval
-    return Skill(
-        metric=seeds[0].metric.name,
-        reference=name,
-        value=1.0 - ratio.value,
-        interval=(1.0 - high, 1.0 - low),
-        std=ratio.std,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScoreRatio:
-    """Score of a method over that of a reference."""
-
-    value: float  # ratio of the means [1]
-    interval: tuple[float, float]  # 95 % [1]; NaN of few scenarios
-    std: float  # sample standard deviation over seeds [1]; NaN for one
-
-
-def _compute_ratio(seeds: Sequence[Score], reference: Score) -> ScoreRatio | None:
-    """Return the ratio of two scores over the scenarios that both have.
-
-    The interval is that of the ratio of means r = A / B, by the linear part of its
-    logarithm: with e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the
-    score of seed s and b_i that of the reference in scenario i, it is r exp(e). So it
-    stays above 0, and is one point where the ratio is the same everywhere. Two seeds
-    say little: its upper end may lie far up.
-    """
     if seeds[0].metric.direction is not Direction.LOWER:
         return None
-    base = _values_in(reference, seeds[0].scenarios)  # shape [scenario]
-    method = np.stack([score.values for score in seeds])  # shape [seed, scenario]
+    reference = references[name]
+    known = dict(zip(reference.scenarios, reference.values.tolist(), strict=True))
+    # shapes [scenario] and [seed, scenario]
+    base = np.array([known.get(i, math.nan) for i in seeds[0].scenarios])
+    method = np.stack([score.values for score in seeds])
     has_both = ~np.isnan(base) & ~np.isnan(method).all(axis=0)
     base = base[has_both]
     method = method[:, has_both]
@@ -122,41 +89,17 @@ def _compute_ratio(seeds: Sequence[Score], reference: Score) -> ScoreRatio | Non
 
     scale = float(np.mean(base))
     ratio = float(np.mean(mean_over_seeds(method))) / scale
-    relative = _relative_to(base, method, ratio)
+    # of a perfect method zeros, which are certain
+    relative = method / ratio - base if ratio > 0.0 else method
     low, high = bootstrap_interval(relative / scale)
-    return ScoreRatio(
-        value=ratio,
-        interval=(ratio * math.exp(low), ratio * math.exp(high)),
-        std=_std_over_seeds(method, scale),
-    )
-
-
-def _relative_to(base: Floats, method: Floats, ratio: float) -> Floats:
-    """Return ``method / ratio - base``; of a perfect method zeros, which are certain.
-
-    Args:
-        base: scores of the reference, shape [scenario].
-        method: scores of the method, shape [..., scenario].
-        ratio: ratio of their means [1].
-    """
-    if ratio > 0.0:
-        return method / ratio - base
-    return method
-
-
-def _values_in(score: Score, scenarios: Sequence[int]) -> Floats:
-    """Return the values of a score in scenarios, NaN in others, shape [scenario]."""
-    values = dict(zip(score.scenarios, score.values.tolist(), strict=True))
-    return np.array([values.get(i, math.nan) for i in scenarios])
-
-
-def _std_over_seeds(method: Floats, scale: float) -> float:
-    """Return the standard deviation over the seeds that have a value in all scenarios.
-
-    NaN with fewer than two such seeds. Scores have the shape [seed, scenario].
-    """
     complete = method[~np.isnan(method).any(axis=1)]
-    if len(complete) < 2:
-        return math.nan
-    means = np.mean(complete, axis=1) / scale
-    return float(np.std(means, ddof=1))
+    std = math.nan
+    if len(complete) > 1:
+        std = float(np.std(np.mean(complete, axis=1) / scale, ddof=1))
+    return Skill(
+        metric=seeds[0].metric.name,
+        reference=name,
+        value=1.0 - ratio,
+        interval=(1.0 - ratio * math.exp(high), 1.0 - ratio * math.exp(low)),
+        std=std,
+    )

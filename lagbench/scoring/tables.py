@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 
 from lagbench.errors import format_count
 from lagbench.figures.tables import Table
@@ -15,9 +15,8 @@ from lagbench.submission.issues import quote
 
 from .card import BRIEF_ROWS, ScoreCard
 from .compare import ComparisonResult, MetricComparison
-from .flags import Flag
 from .front import Speedup
-from .scenario import SUBMISSION
+from .task import SUBMISSION
 
 SHOWN_AT_FRAMES = (
     "vorticity_mse",
@@ -66,54 +65,42 @@ def card_tables(
             only the best one.
     """
     names = card.chosen_metrics
+    frame_names = [name for name in SHOWN_AT_FRAMES if name in card.submission]
     if every:
         names = list(card.submission)
-        frame_names = []
-        for name in names:
-            if card.submission[name].metric.per_frame:
-                frame_names.append(name)
-    else:
-        frame_names = []
-        for name in SHOWN_AT_FRAMES:
-            if name in card.submission:
-                frame_names.append(name)
-
+        frame_names = [name for name in names if card.submission[name].metric.per_frame]
     references = _best_reference(card)
     if all_references:
         references = [row for row in card.scores if row != SUBMISSION]
 
     yield _over_horizon(card, names, references)
-    yield _at_frames(card, frame_names)
-    yield _per_scenario(card, [SUBMISSION, *references])
+    frames = card.reported_frames
+    rows: list[tuple[str, ...]] = []
+    for name in frame_names:
+        score = card.submission[name]
+        rows.append((name, *(_number(mean(score.at(frame))) for frame in frames)))
+    title = f"{card.header.method} at frames, mean over scenarios"
+    yield Table(title, ("metric", *map(str, frames)), tuple(rows))
+
+    shown = [SUBMISSION, *references]
+    columns = [card.scores[row][card.ranking].values.tolist() for row in shown]
+    rows = []
+    for i, *values in zip(card.scenarios, *columns, strict=True):
+        rows.append((str(i), *map(_number, values)))
+    heads = ("scenario", *map(_break_name, shown))
+    yield Table(f"{card.ranking} per scenario", heads, tuple(rows))
+
+
+def brief_table(card: ScoreCard) -> Table:
+    """Return skill and the first metrics, beside the best reference."""
+    return _over_horizon(card, card.chosen_metrics[:BRIEF_ROWS], _best_reference(card))
 
 
 def _best_reference(card: ScoreCard) -> list[str]:
     """Return the reference of the skill, else the first one, else none."""
     if card.skill:
         return [card.skill.reference]
-    references = [row for row in card.scores if row != SUBMISSION]
-    return references[:1]
-
-
-def brief_table(card: ScoreCard) -> Table:
-    """Return skill and the first metrics, beside the best reference."""
-    names = card.chosen_metrics[:BRIEF_ROWS]
-    return _over_horizon(card, names, _best_reference(card))
-
-
-def brief_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield the lines below the brief table: comparison, raised flags, warnings."""
-    yield LEGEND
-    yield from _undefined_lines(card, card.chosen_metrics[:BRIEF_ROWS])
-    for row in _best_reference(card):
-        yield f"against {row}: {_against(card, row)}"
-    yield from _cost_lines(card)
-    if not isinstance(card.speedup, Speedup):
-        yield f"speedup: none, because {card.speedup}"
-    for flag in card.flags:
-        if flag.raised:
-            yield _flag_line(flag)
-    yield from _warning_lines(card)
+    return [row for row in card.scores if row != SUBMISSION][:1]
 
 
 def _over_horizon(
@@ -125,13 +112,10 @@ def _over_horizon(
     if card.skill is not None:
         skill_cell = _with_interval(card.skill.value, card.skill.interval)
         best = card.skill.reference
-    zeros = []
-    for row in references:
-        zeros.append("0" if row == best else "")
+    zeros = ["0" if row == best else "" for row in references]
     rows = [("skill ↑", skill_cell, *zeros)]
     if isinstance(card.speedup, Speedup):
         rows.append(("speedup ↑", str(card.speedup), *[""] * len(references)))
-
     for name in names:
         score = card.submission[name]
         cell = _with_interval(score.mean, score.interval)
@@ -139,7 +123,8 @@ def _over_horizon(
             cell += " †"
         means = []
         for row in references:
-            means.append(_mean_cell(card, row, name))
+            reference = card.scores[row].get(name)
+            means.append("-" if reference is None else _number(reference.mean))
         rows.append((_label(score.metric), cell, *means))
 
     task = f"{card.data_name}, {card.config.horizon} frames"
@@ -148,75 +133,35 @@ def _over_horizon(
     return Table(title, ("metric", f"{SUBMISSION} [95 %]", *heads), tuple(rows))
 
 
-def _mean_cell(card: ScoreCard, row: str, name: str) -> str:
-    if name not in card.scores[row]:
-        return "-"
-    return _number(card.scores[row][name].mean)
-
-
-def _at_frames(card: ScoreCard, names: Collection[str]) -> Table:
-    """Return the table of scores at the frames of interest."""
-    frames = card.reported_frames
-    rows: list[tuple[str, ...]] = []
-    for name in names:
-        score = card.submission[name]
-        cells = []
-        for frame in frames:
-            cells.append(_number(mean(score.at(frame))))
-        rows.append((name, *cells))
-    title = f"{card.header.method} at frames, mean over scenarios"
-    return Table(title, ("metric", *map(str, frames)), tuple(rows))
-
-
-def _per_scenario(card: ScoreCard, shown: Sequence[str]) -> Table:
-    """Return the table of the ranking metric by scenario."""
-    columns = []
-    for row in shown:
-        columns.append(card.scores[row][card.ranking].values.tolist())
-    rows: list[tuple[str, ...]] = []
-    for i, *values in zip(card.scenarios, *columns, strict=True):
-        rows.append((str(i), *map(_number, values)))
-    heads = ("scenario", *map(_break_name, shown))
-    return Table(f"{card.ranking} per scenario", heads, tuple(rows))
-
-
 def _label(metric: Metric) -> str:
     """Return the name of a metric, the mark of its better side, and its unit."""
     label = f"{metric.name}{ARROWS[metric.direction]}"
-    if metric.unit == "1":
-        return label
-    return f"{label} [{metric.unit}]"
+    return label if metric.unit == "1" else f"{label} [{metric.unit}]"
 
 
 def _break_name(name: str) -> str:
     """Return a name as the head of a column, broken into lines at its hyphens."""
-    return "-\n".join(name.split("-"))
+    return name.replace("-", "-\n")
 
 
-def flag_lines(card: ScoreCard, *, every: bool = False) -> Iterator[str]:
-    """Yield the legend, undefined frames, comparisons, flags and warnings, by line.
+def card_lines(
+    card: ScoreCard, *, brief: bool = False, every: bool = False
+) -> Iterator[str]:
+    """Yield the legend, undefined frames, comparisons, cost, flags and warnings.
 
-    With ``every`` the undefined frames of all metrics are counted, not only those of
-    the chosen ones: as the tables show them.
+    Args:
+        card: the score card.
+        brief: whether only the best reference and raised flags are shown, as below
+            the brief table.
+        every: whether the undefined frames of all metrics are counted, not only those
+            of the chosen ones.
     """
-    names: Collection[str] = card.chosen_metrics
-    if every:
-        names = card.submission
+    names: Collection[str] = card.submission if every else card.chosen_metrics
+    references = [row for row in card.scores if row != SUBMISSION]
+    if brief:
+        names = card.chosen_metrics[:BRIEF_ROWS]
+        references = _best_reference(card)
     yield LEGEND
-    yield from _undefined_lines(card, names)
-    for row in card.scores:
-        if row != SUBMISSION:
-            yield f"against {row}: {_against(card, row)}"
-    yield from _cost_lines(card)
-    if not isinstance(card.speedup, Speedup):
-        yield f"speedup: none, because {card.speedup}"
-    for flag in card.flags:
-        yield _flag_line(flag)
-    yield from _warning_lines(card)
-
-
-def _undefined_lines(card: ScoreCard, names: Collection[str]) -> Iterator[str]:
-    """Yield the line that counts frames without a value, if there are any."""
     undefined = []
     for name, score in card.submission.items():
         count = sum(score.undefined)
@@ -225,37 +170,23 @@ def _undefined_lines(card: ScoreCard, names: Collection[str]) -> Iterator[str]:
     if undefined:
         frames = len(card.scenarios) * card.config.horizon
         yield f"† frames without a value, of {frames}: {', '.join(undefined)}"
-
-
-def _cost_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield the cost that predictions state, if they do."""
-    header = card.header
-    if header.seconds_per_frame is None:
-        return
-    machine = "a machine without a name"
-    if header.device:
-        machine = quote(header.device)  # a stranger's text on a terminal
-    yield (
-        f"cost: {_number(header.seconds_per_frame)} s per frame on {machine}; the "
-        f"predictions state it, and nothing was timed here"
-    )
-
-
-def _flag_line(flag: Flag) -> str:
-    line = f"flag {flag.name}: {FLAG_STATES[flag.raised]}"
-    if flag.reasons:
-        line += f": {'; '.join(flag.reasons)}"
-    return line
-
-
-def _warning_lines(card: ScoreCard) -> Iterator[str]:
-    for warning in card.warnings:
-        place = ""
-        if warning.where not in warning.got:
-            place = f" ({warning.where})"
-        yield f"warning [{warning.check}] {warning.what}{place}: {warning.got}"
-        if warning.fix:
-            yield f"  fix: {warning.fix}"
+    for row in references:
+        yield f"against {row}: {_against(card, row)}"
+    if card.header.seconds_per_frame is not None:
+        machine = "a machine without a name"
+        if card.header.device:
+            machine = quote(card.header.device)  # a stranger's text on a terminal
+        yield (
+            f"cost: {_number(card.header.seconds_per_frame)} s per frame on {machine}; "
+            f"the predictions state it, and nothing was timed here"
+        )
+    if not isinstance(card.speedup, Speedup):
+        yield f"speedup: none, because {card.speedup}"
+    for flag in card.flags:
+        if flag.raised or not brief:
+            reasons = f": {'; '.join(flag.reasons)}" if flag.reasons else ""
+            yield f"flag {flag.name}: {FLAG_STATES[flag.raised]}{reasons}"
+    yield from map(str, card.warnings)
 
 
 def _against(card: ScoreCard, row: str) -> str:
@@ -295,18 +226,31 @@ def comparison_tables(
     where more of the metric is better. With ``every`` all metrics are shown, not only
     the chosen ones.
     """
-    shown = _shown_metrics(result, every=every)
+    differences = []
+    means = []
+    for comparison in _shown_metrics(result, every=every):
+        test = comparison.test
+        metric = comparison.metric
+        # no unit, so that four columns fit a terminal
+        differences.append(
+            (
+                f"{metric.name}{ARROWS[metric.direction]}",
+                _side(comparison),
+                _with_interval(test.difference, test.interval),
+                "-" if math.isnan(test.p) else f"{test.p:.3g}",
+            )
+        )
+        cells = [_label(metric)]
+        both = (comparison.first, comparison.second)
+        for value, undefined in zip(both, comparison.undefined, strict=True):
+            mark = f" †{undefined}" if undefined else ""
+            cells.append(f"{_number(value)}{mark}")
+        means.append(tuple(cells))
+    first = _break_name(result.first)
     title = f"{result.first} against {result.second} on {result.split} {result.size}"
-    yield Table(
-        title,
-        ("metric", f"{_break_name(result.first)}\nis", "loss difference [95 %]", "p"),
-        tuple(_difference_row(comparison) for comparison in shown),
-    )
-    yield Table(
-        "means",
-        ("metric", _break_name(result.first), _break_name(result.second)),
-        tuple(_means_row(comparison) for comparison in shown),
-    )
+    heads = ("metric", f"{first}\nis", "loss difference [95 %]", "p")
+    yield Table(title, heads, tuple(differences))
+    yield Table("means", ("metric", first, _break_name(result.second)), tuple(means))
 
 
 def comparison_lines(result: ComparisonResult, *, every: bool = False) -> Iterator[str]:
@@ -329,26 +273,7 @@ def comparison_lines(result: ComparisonResult, *, every: bool = False) -> Iterat
 def _shown_metrics(result: ComparisonResult, *, every: bool) -> list[MetricComparison]:
     """Return the metrics of the tables: the chosen ones, or all."""
     chosen = (result.ranking, *CHOSEN)
-    shown = []
-    for name, comparison in result.metrics.items():
-        if every or name in chosen:
-            shown.append(comparison)
-    return shown
-
-
-def _difference_row(comparison: MetricComparison) -> tuple[str, ...]:
-    """Return the row of a metric: name, better or worse, difference, p-value.
-
-    It has no unit, so that four columns fit a terminal.
-    """
-    test = comparison.test
-    p = "-"
-    if not math.isnan(test.p):
-        p = f"{test.p:.3g}"
-    difference = _with_interval(test.difference, test.interval)
-    metric = comparison.metric
-    label = f"{metric.name}{ARROWS[metric.direction]}"
-    return (label, _side(comparison), difference, p)
+    return [one for name, one in result.metrics.items() if every or name in chosen]
 
 
 def _side(comparison: MetricComparison) -> str:
@@ -358,25 +283,7 @@ def _side(comparison: MetricComparison) -> str:
         return side
     if len(comparison.test.scenarios) < FEWEST_SCENARIOS:
         return TOO_FEW
-    if not comparison.test.significant:
-        return f"{side}{CHANCE}"
-    return side
-
-
-def _means_row(comparison: MetricComparison) -> tuple[str, ...]:
-    first_undefined, second_undefined = comparison.undefined
-    return (
-        _label(comparison.metric),
-        _with_undefined(comparison.first, first_undefined),
-        _with_undefined(comparison.second, second_undefined),
-    )
-
-
-def _with_undefined(value: float, undefined: int) -> str:
-    """Return a mean with the number of frames that are left out of it."""
-    if undefined:
-        return f"{_number(value)} †{undefined}"
-    return _number(value)
+    return side if comparison.test.significant else f"{side}{CHANCE}"
 
 
 def _with_interval(value: float, interval: tuple[float, float]) -> str:

@@ -1,12 +1,14 @@
-"""The test subset as metrics see it: the truth that submissions are scored against.
+"""The test subset as metrics see it, and the measurement of its scenarios.
 
 Scoring needs the files of ``test`` only; statistics of ``train`` are read from
-datasets.yaml or, for a data set that is not recorded there, from its manifest.
+datasets.yaml or, for a data set that is not recorded there, from its manifest. The
+truth's snapshots and fields are formed once for the submission and the references
+beside it; memory is that of a few frames, whatever the horizon.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +17,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.data.box import parse_obstacle
 from lagbench.data.local import suggest_repair
-from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import DataError
-from lagbench.metrics.frame import Scenario, Snapshot, TaskConfig, snapshots
+from lagbench.metrics.aggregate import Tally, measure, round_statistics
+from lagbench.metrics.frame import (
+    FramePair,
+    Scenario,
+    Snapshot,
+    TaskConfig,
+    snapshots,
+)
+from lagbench.metrics.metric import Metric
+from lagbench.references.predictor import Given, Prediction, ReferencePredictor
 from lagbench.store.copy import update_working_copy
 from lagbench.submission.truth import Truth
+from lagbench.work.executor import Report
+
+from .flags import Trace, Tracer
+
+SUBMISSION = "submission"
+"""Row of the submission; reference predictors have rows of their names."""
 
 BLOCK_BYTES = 1 << 20
 """True positions are read in blocks of about this size [bytes].
@@ -39,25 +55,18 @@ class OpenScenario:
     scenario: Scenario  # properties that all its frames share
     file: ScenarioFile
 
-    @property
-    def obstacle(self) -> NDArray[np.float32] | None:
-        """Centre and radius of a fixed obstacle [length]; None without one."""
-        parameters = self.file.header.parameters
-        dimension = self.scenario.config.box.dimension
-        return parse_obstacle(parameters, dimension, where=str(self.file.path))
-
     def snapshots(self) -> Iterator[Snapshot]:
         """Yield the true snapshots of the predicted frames; a block is in memory."""
-        return snapshots(self.scenario, self._frames())
-
-    def _frames(self) -> Iterator[NDArray[np.float32]]:
         numbers = self.scenario.config.predicted_frames
-        particle_bytes = 4 * self.scenario.config.box.dimension
-        frame_bytes = particle_bytes * len(self.scenario.material)
+        frame_bytes = 4 * self.scenario.input_positions[0].size
         step = max(1, BLOCK_BYTES // frame_bytes)
-        for first in numbers[::step]:
-            last = min(first + step, numbers.stop)
-            yield from self.file.read("position", slice(first, last))
+
+        def frames() -> Iterator[NDArray[np.float32]]:
+            for first in numbers[::step]:
+                last = min(first + step, numbers.stop)
+                yield from self.file.read("position", slice(first, last))
+
+        return snapshots(self.scenario, frames())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,27 +132,53 @@ def load_scored_task(
         truth.check()
 
     scenarios = sorted(size.subsets[subset])
+    task = size.task
+    needed = task.input_frames + task.horizon
     present: set[str] = set()
     for scenario in scenarios:
-        present.update(_materials(truth, scenario))
+        with truth.open(scenario) as file:
+            if file.header.frames < needed:
+                raise DataError(
+                    f"{file.header.frames} frames, the task needs {needed}; make the "
+                    "data again, or shorten the task in split.yaml",
+                    where=str(truth.path(scenario)),
+                )
+            file.check_material()
+            numbers = np.unique(file.read("material")).tolist()
+        present.update(MATERIALS[number] for number in numbers)
 
+    statistics: Mapping[str, tuple[float, ...]] = {}
+    limit: tuple[float, ...] = ()
+    manifest = None
     if size.measured:
-        statistics: Mapping[str, tuple[float, ...]] = size.measured.statistics
-        limit = size.measured.twin_floor
-        if subset == "shift":
-            limit = ()  # it was measured on test
+        statistics = size.measured.statistics
+        if subset != "shift":  # it was measured on test
+            limit = size.measured.twin_floor
     else:
         manifest = read_manifest(root, size.split, size.name, size.major)
-        statistics = manifest.statistics if manifest else {}
-        limit = _predictability_limit(manifest, scenarios)
+    if manifest is not None:
+        statistics = manifest.statistics
+        entries = [manifest.entry(scenario) for scenario in scenarios]
+        limits = [() if entry is None else entry.twin_floor for entry in entries]
+        # every scenario has one, and all have the same number of frames
+        if limits[0] and len({len(one) for one in limits}) == 1:
+            limit = tuple(np.mean(limits, axis=0).tolist())
+    position_std = statistics.get("position_std", ())
+    velocity_std = statistics.get("velocity_std", ())
+    if not len(position_std) == len(velocity_std) == size.dimension:
+        raise DataError(
+            "position_std and velocity_std of train are not recorded, neither in "
+            f"{size.record_name} nor in the manifest; "
+            f"{suggest_repair(size, root=root)}",
+            where=f"{size.split} {size.name} in {root}",
+        )
 
-    task = size.task
     config = TaskConfig(
         grid=size.field_grid,
         input_frames=task.input_frames,
         horizon=task.horizon,
         frames_of_interest=task.frames_of_interest,
-        attribute_std=_attribute_std(size, root, statistics),
+        attribute_std=(*position_std, *velocity_std),
         radius=task.radius,
         materials=tuple(name for name in MATERIALS if name in present),
     )
@@ -163,69 +198,45 @@ def _active_frames(file: ScenarioFile) -> int | None:
     if isinstance(stated, int | np.integer) and stated >= 0:
         return int(stated)
     raise DataError(
-        "active_frames is no number of frames",
+        f"active_frames is {stated!r:.40}, no number of frames; make the data again",
         where=str(file.path),
-        expected="a whole number from 0",
-        got=stated,
-        fix="mend the parameter in the file, or make the data again",
     )
 
 
-def _materials(truth: Truth, scenario: int) -> set[str]:
-    """Return the materials of a scenario after a check of its length and of them."""
-    needed = truth.size.task.input_frames + truth.size.task.horizon
-    with truth.open(scenario) as file:
-        frames = file.header.frames
-        file.check_material()
-        material = file.read("material")
-    if frames < needed:
-        raise DataError(
-            f"a {truth.subset} scenario is too short",
-            where=str(truth.path(scenario)),
-            expected=f"{needed} frames",
-            got=frames,
-            fix="make the data again, or shorten the task in split.yaml",
-        )
-    return {MATERIALS[value] for value in np.unique(material).tolist()}
+def predict_reference(reference: ReferencePredictor, given: Given) -> Prediction:
+    """Return the prediction of a reference; train is fetched if it is read."""
+    if reference.reads_train:
+        update_working_copy(given.size, given.root, given.size.subsets["train"])
+    return reference.predict(given)
 
 
-def _attribute_std(
-    size: Size, root: Path, statistics: Mapping[str, tuple[float, ...]]
-) -> tuple[float, ...]:
-    """Return the standard deviations of position and velocity components over train."""
-    dimension = size.box.dimension
-    position_std = statistics.get("position_std", ())
-    velocity_std = statistics.get("velocity_std", ())
-    if len(position_std) != dimension or len(velocity_std) != dimension:
-        raise DataError(
-            "the statistics of train are not recorded",
-            where=f"{size.record_name}, and the manifest of {size.split} {size.name} "
-            f"in {root}",
-            expected=f"position_std and velocity_std, {dimension} numbers each",
-            got=", ".join(statistics) or "nothing",
-            fix=suggest_repair(size, root=root),
-        )
-    return (*position_std, *velocity_std)
+def measure_rows(
+    scenario: Scenario,
+    truth: Iterator[Snapshot],
+    rows: Mapping[str, Iterator[Snapshot]],
+    *,
+    metrics: tuple[Metric, ...],
+    report: Report = lambda _: None,
+) -> tuple[dict[str, Tally], Trace]:
+    """Measure rows of predictions of one scenario side by side, frame by frame.
 
-
-def _predictability_limit(
-    manifest: Manifest | None, scenarios: Sequence[int]
-) -> tuple[float, ...]:
-    """Return the predictability limit (``twin_floor``) per frame.
-
-    It is the mean over scenarios. Empty unless every scenario has one and all have the
-    same number of frames.
+    Returns:
+        The rounded statistics by row, and the trace of the first row.
     """
-    if manifest is None:
-        return ()
-    limits = []
-    for scenario in scenarios:
-        entry = manifest.entry(scenario)
-        if entry is None or not entry.twin_floor:
-            return ()
-        limits.append(entry.twin_floor)
+    frames = scenario.config.predicted_frames
+    tracer = Tracer(scenario)
+    first = next(iter(rows))
+    measured: dict[str, dict[int, dict[str, float]]] = {name: {} for name in rows}
+    for frame, true, *predicted in zip(frames, truth, *rows.values(), strict=True):
+        for name, snapshot in zip(rows, predicted, strict=True):
+            pair = FramePair(scenario, frame, true, snapshot)
+            measured[name][frame] = measure(pair, metrics)
+            if name == first:
+                tracer.add(pair)
+        report(1)
 
-    lengths = {len(limit) for limit in limits}
-    if len(lengths) != 1:
-        return ()
-    return tuple(np.mean(limits, axis=0).tolist())
+    names = [metric.name for metric in metrics if metric.statistic is not None]
+    tallies = {}
+    for name, values in measured.items():
+        tallies[name] = round_statistics(Tally.of(names, frames, values))
+    return tallies, tracer.trace

@@ -6,14 +6,23 @@ HDF5 cannot read at all raises.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import h5py
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    Json,
+    StringConstraints,
+    ValidationError,
+)
+from pydantic_core import ErrorDetails
 
 from lagbench.data.box import AXES
 from lagbench.data.hdf5 import (
@@ -33,7 +42,7 @@ from lagbench.data.structure import (
 )
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 
-from .budget import Budget, parse_budget
+from .budget import Budget
 from .issues import IssueCollector, quote
 from .provenance import TrainingProvenance
 
@@ -55,23 +64,10 @@ OTHERS: Mapping[str, str] = {
 NEVER = -1
 """Value of ``diverged_at`` for a rollout that did not diverge."""
 
-REQUIRED = ("split", "size", "dataset_version", "dataset_sha256", "method")
-"""Text attributes that every file has, beside ``lagbench_format``."""
+IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
+"""Text attributes that every file has: the predicted data set and the method."""
 
-OPTIONAL: Mapping[str, type[str] | type[int] | type[float]] = {
-    "seconds_per_frame": float,
-    "device": str,
-    "seed": int,
-    "parameters": int,
-    "training": str,
-    "solver_seconds_per_frame": float,
-    "budget": str,
-    "provenance": str,
-    "subset": str,
-}
-"""Attributes that a file may have: cost, provenance and size of the model, and the
-subset, which is ``test`` where none is named.
-"""
+HASH = re.compile(r"[0-9a-f]{64}")
 
 MAX_NAME = 200
 """Longest required attribute [characters]."""
@@ -108,57 +104,74 @@ ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
 }
 """Attributes of each variable, as we write them."""
 
-USE_TEMPLATE = (
-    "start from what `lagbench template` writes, or use lagbench.submission.write"
-)
 WRITE = (
     "write it with lagbench.submission.write, or fill what `lagbench template` writes"
 )
 """How to get a right file."""
 
-WRITE_IN_CHUNKS = (
-    "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
-)
 
-SURROGATES = re.compile("[\ud800-\udfff]")
-"""Characters that no UTF-8 has."""
+def require_name(text: str) -> str:
+    """Return a text that can be a required attribute; terminals may show it as it is.
 
-KINDS = {
-    str: f"text of at most {MAX_ATTRIBUTE} characters, without NUL and surrogates",
-    int: "an integer of 64 bits",
-    float: "a positive number",
-}
-"""Types of optional attributes in words."""
+    Raises:
+        ValueError: it is empty, too long or not printable.
+    """
+    if not text.strip() or len(text) > MAX_NAME or not text.isprintable():
+        raise ValueError(f"not printable text of 1 to {MAX_NAME} characters")
+    return text
 
 
-@dataclass(frozen=True, kw_only=True)
-class Header:
+Name = Annotated[str, AfterValidator(require_name)]
+# HDF5 stores texts up to the first NUL
+Text = Annotated[
+    str, StringConstraints(max_length=MAX_ATTRIBUTE, pattern=r"^[^\x00]*$")
+]
+Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Labels(BaseModel):
+    """Attributes that a writer may set: method, cost, origin and size of the model."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    method: Name = "unnamed"  # what made the predictions
+    seconds_per_frame: Seconds | None = None  # cost of one predicted frame [s]
+    device: Text | None = None  # machine that predicted
+    # seed of the training
+    seed: Annotated[int, Field(ge=-(2**63), lt=2**64)] | None = None
+    # trainable parameters of the model
+    parameters: Annotated[int, Field(ge=0, lt=2**64)] | None = None
+    training: Text | None = None  # what the model was trained on, in words
+    # of our solver on one core of the same machine [s]
+    solver_seconds_per_frame: Seconds | None = None
+    budget: Json[Budget] | None = None  # what the training took
+    provenance: Json[TrainingProvenance] | None = None  # the training behind the model
+
+
+class Attributes(Labels):
+    """The global attributes of a file."""
+
+    lagbench_format: Literal[1]
+    split: Name
+    size: Name
+    dataset_version: Name  # semantic version of the split, as in "1.0.0"
+    dataset_sha256: Name  # hash of the data set that the model was given
+    method: Name
+    subset: Text = "test"  # subset whose scenarios are predicted
+
+
+class Header(Attributes):
     """What a predictions.nc says about itself."""
 
-    split: str
-    size: str
-    dataset_version: str  # semantic version of the split, as in "1.0.0"
-    dataset_sha256: str  # hash of the data set that the model was given, 64 hex digits
-    method: str  # what made the predictions
+    lagbench_format: Literal[1] = FORMAT
     scenarios: tuple[int, ...]  # ids in the order in which they are stored
     frames: tuple[int, ...]  # absolute numbers of the predicted frames
     particles: int  # particles in every frame; the most of any scenario
-    seconds_per_frame: float | None  # cost of one predicted frame [s]
-    device: str | None  # machine that predicted
-    seed: int | None  # seed of the training
-    parameters: int | None  # trainable parameters of the model
-    training: str | None  # what the model was trained on, in words
     # scenario id to the absolute frame from which it is frozen
-    diverged_at: Mapping[int, int]
-    # of our solver on one core of the same machine [s]
-    solver_seconds_per_frame: float | None = None
-    budget: Budget | None = None  # what the training took
-    # the training that made the model
-    provenance: TrainingProvenance | None = None
+    diverged_at: Mapping[int, int] = {}
     # scenario id to its number of particles; empty where all have as many
-    particle_counts: Mapping[int, int] = field(default_factory=dict)
+    particle_counts: Mapping[int, int] = {}
     space: int = 2  # components of a position
-    subset: str = "test"  # subset whose scenarios are predicted
 
     def particle_count(self, scenario: int) -> int:
         """Return how many particles a scenario has."""
@@ -172,122 +185,88 @@ class FileInfo:
     # entry of the root group to what it is; the first MAX_LINKS of them
     links: Mapping[str, str]
     link_count: int
-    # attribute of the format to its value, None where it is missing
-    attributes: Mapping[str, object]
+    attributes: Mapping[str, object]  # attributes of the format that it has
     arrays: Mapping[str, ArrayInfo]  # variables of the format that a hard link leads to
-    # scale_factor and add_offset of ``position``, where it has them
-    packing: Mapping[str, object]
+    packing: Mapping[str, object]  # scale_factor and add_offset of ``position``
     integers: Mapping[str, tuple[int, ...]]  # coordinates whose values could be read
     components: tuple[str, ...]  # names of the components of a position, if any
     length: int  # length of the file [bytes]
 
-
-def describe_kind(name: str) -> str:
-    """Return in words what an attribute must be.
-
-    >>> describe_kind("seed"), describe_kind("parameters")
-    ('an integer of 64 bits', 'an integer of 64 bits >= 0')
-    """
-    if name in REQUIRED:
-        return f"printable text of 1 to {MAX_NAME} characters"
-    if name == "budget":
-        return "JSON of a training's budget"
-    if name == "provenance":
-        return "JSON of a training's provenance"
-    kind = KINDS[OPTIONAL[name]]
-    if name == "parameters":
-        return f"{kind} >= 0"
-    return kind
-
-
-def is_attribute_valid(name: str, value: object) -> bool:
-    """Return whether an attribute may have a value.
-
-    >>> is_attribute_valid("seed", -5), is_attribute_valid("parameters", -5)
-    (True, False)
-    >>> is_attribute_valid("parameters", 0), is_attribute_valid("method", " ")
-    (True, False)
-    """
-    if name in REQUIRED:
-        return isinstance(value, str) and is_name_valid(value)
-    if isinstance(value, bool):
-        return False
-    if isinstance(value, str):
-        return OPTIONAL[name] is str and is_text_valid(name, value)
-    if isinstance(value, int):
-        return is_integer_valid(name, value)
-    if isinstance(value, float):
-        return OPTIONAL[name] is float and 0 < value < math.inf
-    return False
-
-
-def is_name_valid(text: str) -> bool:
-    """Return whether a text can be a required attribute."""
-    return bool(text.strip()) and len(text) <= MAX_NAME and text.isprintable()
-
-
-def require_name(text: str) -> str:
-    """Return a text that can be a required attribute; terminals may show it as it is.
-
-    Raises:
-        ValueError: it is empty, too long or not printable.
-    """
-    if not is_name_valid(text):
-        raise ValueError(f"not {describe_kind('method')}")
-    return text
-
-
-def is_text_valid(name: str, text: str) -> bool:
-    """Return whether a text can be an optional attribute.
-
-    HDF5 stores UTF-8, up to the first NUL.
-    """
-    if len(text) > MAX_ATTRIBUTE or SURROGATES.search(text) or "\0" in text:
-        return False
-    if name == "budget":
-        return parse_budget(text) is not None
-    if name == "provenance":
-        return TrainingProvenance.from_json(text) is not None
-    return True
-
-
-def is_integer_valid(name: str, value: int) -> bool:
-    """Return whether an integer can be an optional attribute."""
-    if not -(2**63) <= value < 2**64:
-        return False
-    if OPTIONAL[name] is float:
-        return value > 0
-    if name == "parameters":
-        return value >= 0
-    return OPTIONAL[name] is int
-
-
-def require_valid_attribute(name: str, value: object) -> None:
-    """Refuse a value that an attribute may not have, before it is written.
-
-    Raises:
-        UsageError: it is such a value.
-    """
-    if not is_attribute_valid(name, value):
-        raise UsageError(
-            f"the label {name!r} does not fit",
-            where=f"label {name!r}",
-            expected=describe_kind(name),
-            got=quote(value),
-            fix="docs/predictions.md describes the labels; leave out a label that you "
-            "do not know",
+    @property
+    def header(self) -> Header:
+        """The header of a file whose layout has been checked."""
+        attributes, _ = read_attributes(self.attributes)
+        scenarios = self.integers["scenario"]
+        frozen_from = dict(
+            zip(scenarios, self.integers.get("diverged_at", ()), strict=False)
+        )
+        counts = self.integers.get("particle_count", ())
+        _, _, particles, space = self.arrays["position"].shape or (0, 0, 0, 0)
+        return Header.model_construct(
+            **dict(attributes),
+            scenarios=scenarios,
+            frames=self.integers["frame"],
+            particles=particles,
+            particle_counts=dict(zip(scenarios, counts, strict=False)),
+            space=space,
+            diverged_at={i: frame for i, frame in frozen_from.items() if frame >= 0},
         )
 
 
+def read_attributes(
+    given: Mapping[str, object],
+) -> tuple[Attributes, list[ErrorDetails]]:
+    """Return the attributes that can be used, and what is wrong with the others."""
+    try:
+        return Attributes.model_validate(given), []
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_input=False)
+    wrong = {fault["loc"][0] for fault in faults}
+    usable: dict[str, object] = {**dict.fromkeys(IDENTITY, "?"), "lagbench_format": 1}
+    for name in given.keys() - wrong:
+        usable[name] = given[name]
+    return Attributes.model_validate(usable), faults
+
+
+def check_labels(labels: Mapping[str, object]) -> None:
+    """Refuse values that attributes may not have, before they are written.
+
+    Raises:
+        UsageError: there is no such label, or it cannot have that value.
+    """
+    try:
+        Labels.model_validate(dict(labels))
+    except ValidationError as error:
+        issue = error.errors(include_url=False, include_input=False)[0]
+        name = str(issue["loc"][0])
+        what = f"{issue['msg']}; docs/predictions.md describes the labels"
+        if name not in Labels.model_fields:
+            what = f"no such label; {suggest_name(name, Labels.model_fields)}"
+        raise UsageError(what, where=f"label {quote(name)}") from None
+
+
 def inspect_file(file: h5py.File, path: Path) -> FileInfo:
-    """Return what a file holds; of values only coordinates are read."""
+    """Return what a file holds; of values only coordinates are read.
+
+    Raises:
+        UnreadableFileError: HDF5 cannot read it, or it is a score file or a scenario
+            file: all checks of those would mislead.
+    """
     length = path.stat().st_size
     with hdf5_errors(path):
         root = file["/"]
         links, link_count = list_members(root)
         attributes = {}
-        for name in ("lagbench_format", *REQUIRED, *OPTIONAL):
-            attributes[name] = read_single_value(root, name)
+        for name in Attributes.model_fields:
+            value = read_single_value(root, name)
+            if value is not None:
+                attributes[name] = value
+    if not {"position", "scenario"} <= links.keys():
+        for name, kind in OTHERS.items():
+            if name in links:
+                raise UnreadableFileError(
+                    f"no predictions, but {kind}; name predictions", where=str(path)
+                )
 
     arrays = {}
     integers = {}
@@ -298,16 +277,16 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
         with hdf5_errors(path, name):
             dataset = open_variable(file, name)
             array = describe_array(dataset)
-            if name == "particle":  # without values netCDF keeps a float in its place
-                if is_coordinate_readable(array, length=length):
-                    integers[name] = tuple(int(value) for value in dataset[...])
-                continue
-            # A scalar has no dimensions to check.
-            arrays[name] = array if array.shape else replace(array, shape=None)
             if name == "position":
-                packing = read_packing(dataset)
+                for attribute in PACKING:
+                    value = read_single_value(dataset, attribute)
+                    if value is not None:
+                        packing[attribute] = value
             elif is_coordinate_readable(array, length=length):
                 integers[name] = tuple(int(value) for value in dataset[...])
+            if name != "particle":  # without values netCDF keeps a float in its place
+                # A scalar has no dimensions to check.
+                arrays[name] = array if array.shape else replace(array, shape=None)
     components: tuple[str, ...] = ()
     if links.get("space") == "variable":
         with hdf5_errors(path, "space"):
@@ -326,12 +305,6 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
     )
 
 
-def read_packing(dataset: h5py.Dataset) -> dict[str, object]:
-    """Return the attributes of a variable by which its values would be unpacked."""
-    attributes = {name: read_single_value(dataset, name) for name in PACKING}
-    return {name: value for name, value in attributes.items() if value is not None}
-
-
 def is_coordinate_readable(array: ArrayInfo, *, length: int) -> bool:
     """Return whether an array is a list of integers that is safe to read.
 
@@ -347,357 +320,171 @@ def is_coordinate_readable(array: ArrayInfo, *, length: int) -> bool:
     )
 
 
-def header_of(info: FileInfo) -> Header:
-    """Return the header of a file whose layout has been checked."""
-    labels: dict[str, Any] = {name: str(info.attributes[name]) for name in REQUIRED}
-    for name, kind in OPTIONAL.items():
-        value = info.attributes[name]
-        if kind is float and isinstance(value, int):
-            value = float(value)
-        labels[name] = value if isinstance(value, kind) else None
-    labels["subset"] = labels["subset"] or "test"
-    if labels["budget"] is not None:
-        labels["budget"] = parse_budget(labels["budget"])
-    if labels["provenance"]:
-        labels["provenance"] = TrainingProvenance.from_json(labels["provenance"])
+def check_layout(
+    info: FileInfo, issues: IssueCollector, *, dimension: int | None = None
+) -> bool:
+    """Check links, variables, storage, attributes, dimensions and types.
 
-    scenarios = info.integers["scenario"]
-    frozen_from = info.integers.get("diverged_at", ())
-    diverged_at = {}
-    for scenario, frame in zip(scenarios, frozen_from, strict=False):
-        if frame >= 0:
-            diverged_at[scenario] = frame
-    counts = info.integers.get("particle_count", ())
-    particle_counts = dict(zip(scenarios, counts, strict=False))
-    position_shape = info.arrays["position"].shape or ()
-    return Header(
-        **labels,
-        scenarios=scenarios,
-        frames=info.integers["frame"],
-        particles=position_shape[2],
-        particle_counts=particle_counts,
-        space=position_shape[3],
-        diverged_at=diverged_at,
-    )
+    The box has ``dimension`` axes; 2 or 3 where it is not known.
 
-
-def refuse_other_kinds(info: FileInfo, path: Path) -> None:
-    """Refuse a file of ours that holds no predictions.
-
-    All other checks would mislead.
-
-    Raises:
-        UnreadableFileError: it is a score file or a scenario file.
+    Returns:
+        Whether the positions can be read.
     """
-    if {"position", "scenario"} <= info.links.keys():
-        return
-    for name, kind in OTHERS.items():
-        if name in info.links:
-            raise UnreadableFileError(
-                "a file of another kind",
-                where=str(path),
-                expected="predictions",
-                got=kind,
-                fix=USE_TEMPLATE,
-            )
-
-
-def check_format(info: FileInfo, issues: IssueCollector) -> bool:
-    """Check links, variables, storage and attributes.
-
-    Returns whether the values can be read.
-    """
-    issues.complete("format")
-    _check_links(info, issues)
-    _check_variables(info, issues)
-    _check_storage(info, issues)
-    is_readable = not issues.first_failed("format")
-    _check_attributes(info, issues)
-    return is_readable
-
-
-def _check_links(info: FileInfo, issues: IssueCollector) -> None:
     for name, kind in info.links.items():
         if kind.endswith("link"):
             issues.error(
                 "format",
-                f"there is a {kind}, which is not followed",
+                f"a {kind} is not followed; store the values themselves",
                 where=quote(name),
-                expected="variables that lie in this file",
-                got=kind,
-                fix="store the values themselves",
             )
     if info.link_count > MAX_LINKS:
         issues.error(
             "format",
-            "too many variables",
+            f"too many variables, {info.link_count} of at most {MAX_LINKS}; {WRITE}",
             where="/",
-            expected=f"at most {MAX_LINKS}",
-            got=info.link_count,
-            fix=USE_TEMPLATE,
         )
-
-
-def _check_variables(info: FileInfo, issues: IssueCollector) -> None:
-    stored_names = [quote(name) for name in info.links][:10]
     for name in ("position", "scenario", "frame"):
         kind = info.links.get(name, "")
-        if kind == "variable" or kind.endswith("link"):
-            continue
-        if kind or not stored_names:
-            fix = USE_TEMPLATE
-        else:
-            known_names = [quote(stored)[1:-1] for stored in info.links]
-            fix = suggest_name(name, known_names)
-        issues.error(
-            "format",
-            f"no variable {name!r}",
-            where="/",
-            expected=f"a variable {name!r}",
-            got=kind or ", ".join(stored_names) or "nothing",
-            fix=fix,
-        )
-
-
-def _check_storage(info: FileInfo, issues: IssueCollector) -> None:
+        if kind != "variable" and not kind.endswith("link"):
+            known = [quote(stored)[1:-1] for stored in info.links]
+            issues.error(
+                "format",
+                f"no variable {name!r}; {suggest_name(name, known)}",
+                where="/",
+            )
     for name, array in info.arrays.items():
         where = f"variable {name!r}"
         problem = find_storage_issue(array, length=info.length)
         if problem is not None:
-            issues.error(
-                "format",
-                problem.what,
-                where=where,
-                expected=problem.expected,
-                got=problem.got,
-                fix=WRITE_IN_CHUNKS,
-            )
+            what = f"{problem.what}: {problem.got}; {WRITE}"
+            issues.error("format", what, where=where)
         elif name != "position" and name not in info.integers:
             issues.error(
                 "format",
-                "a coordinate cannot be read",
+                f"{array.kind} of shape {array.shape} are no list of at most "
+                f"{MAX_COORDINATE} integers; {WRITE}",
                 where=where,
-                expected=f"one dimension of at most {MAX_COORDINATE} integers",
-                got=f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
-                fix=USE_TEMPLATE,
             )
+    is_stored = not issues.first_failed("format")
 
-
-def _check_attributes(info: FileInfo, issues: IssueCollector) -> None:
-    for name, value in info.attributes.items():
-        if name == "lagbench_format":
-            expected = str(FORMAT)
-            is_right = (
-                not isinstance(value, (str, UnusableAttribute)) and value == FORMAT
-            )
-        elif name in REQUIRED:
-            expected = describe_kind(name)
-            is_right = is_attribute_valid(name, value)
-        else:
-            expected = f"{describe_kind(name)}, or no such attribute"
-            is_right = value is None or is_attribute_valid(name, value)
-        if is_right:
-            continue
-
-        what = f"the attribute {name!r} cannot be used"
-        got = describe_value(value)
-        if value is None:
-            what = f"the attribute {name!r} is missing"
-            got = "no such attribute"
+    _, faults = read_attributes(info.attributes)
+    for fault in faults:
+        name = str(fault["loc"][0])
+        value = info.attributes.get(name)
+        reason = f"{fault['msg']}, got {quote(value)}"
+        if isinstance(value, UnusableAttribute):
+            reason = value.reason
         issues.error(
             "format",
-            what,
-            where="global attributes",
-            expected=expected,
-            got=got,
-            fix=f"set it: file.{name} = ...",
+            f"{reason}; set it: file.{name} = ...",
+            where=f"attribute {name!r}",
         )
 
-
-def describe_value(value: object) -> str:
-    """Return the value of an attribute for a message, or why it has none."""
-    if isinstance(value, UnusableAttribute):
-        return value.reason
-    return quote(value)
-
-
-def check_dims(
-    info: FileInfo, issues: IssueCollector, *, dimension: int | None = None
-) -> bool:
-    """Check names, order and lengths of the dimensions of ``position``.
-
-    The box has ``dimension`` axes; 2 or 3 where it is not known.
-    """
-    array = info.arrays.get("position")
-    if array is None or array.shape is None:
-        issues.skip("'position' cannot be read", "dims")
+    position = info.arrays.get("position")
+    if position is None:
+        issues.skip("there is no variable 'position'", "dims", "dtype")
         return False
-    issues.complete("dims")
     where = "variable 'position'"
-    if array.dims != DIMS:
-        names = []
-        for name in array.dims:
-            names.append(quote(name) if name else "one without a name")
-        issues.error(
-            "dims",
-            "the dimensions are others",
-            where=where,
-            expected=", ".join(DIMS),
-            got=", ".join(names) or "none",
-            fix=_hint_for_dims(array.dims),
-        )
-        return False
-
-    if dimension is None:
-        dimension = array.shape[3] if array.shape[3] in SPACES else SPACES[0]
-    lengths = (
-        _length_of("scenario", info),
-        _length_of("frame", info),
-        array.shape[2],
-        dimension,
-    )
-    if array.shape != lengths:
-        fix = USE_TEMPLATE
-        if array.shape[2] == dimension and array.shape[3] > dimension:
-            fix = "particle and space seem to be swapped: transpose them"
-        issues.error(
-            "dims",
-            "the lengths do not fit",
-            where=where,
-            expected=lengths,
-            got=array.shape,
-            fix=fix,
-        )
-        return False
-    particles = info.integers.get("particle", ())
-    if info.components not in ((), AXES[:dimension]):
-        fault = f"components are named {', '.join(map(quote, info.components))}"
-    elif list(particles) != list(range(len(particles))):
-        fault = "the coordinate particle is not 0, 1, 2 and so on"
-    else:
-        return _check_particle_counts(info, array.shape, issues)
-    issues.error(
-        "dims",
-        "components or particles stand in another order",
-        where=where,
-        expected=f"{', '.join(AXES[:dimension])}, and particles 0, 1, 2 and so on",
-        got=fault,
-        fix="store components x, y, z and particles in the order of the given frames",
-    )
-    return False
-
-
-def _check_particle_counts(
-    info: FileInfo, shape: tuple[int, ...], issues: IssueCollector
-) -> bool:
-    """Check that ``particle_count``, if any, fits into ``position``, shape given."""
-    array = info.arrays.get("particle_count")
-    if array is None:
-        return True
-    counts = info.integers.get("particle_count", ())
-    is_per_scenario = array.dims == ("scenario",) and len(counts) == shape[0]
-    if is_per_scenario and all(1 <= count <= shape[2] for count in counts):
-        return True
-    issues.error(
-        "dims",
-        "the numbers of particles do not fit",
-        where="variable 'particle_count'",
-        expected=f"one number from 1 to {shape[2]} per scenario, on the dimension "
-        f"'scenario'",
-        got=f"{list(counts[:5])} on {', '.join(map(quote, array.dims)) or 'none'}",
-        fix="leave it out where all scenarios have as many particles",
-    )
-    return False
-
-
-def _hint_for_dims(dims: tuple[str, ...]) -> str:
-    if sorted(dims) == sorted(DIMS):
-        return "transpose it"
-    if not any(dims):
-        return "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
-    missing = [name for name in DIMS if name not in dims]
-    if len(dims) != len(DIMS) - 1 or len(missing) != 1:
-        return USE_TEMPLATE
-    if missing == ["scenario"]:
-        return "add the leading dimension 'scenario', also for a single scenario"
-    return f"add the dimension {missing[0]!r}; the order is {', '.join(DIMS)}"
-
-
-def _length_of(name: str, info: FileInfo) -> int | str:
-    """Return the length of a coordinate, in words where it could not be read."""
-    values = info.integers.get(name)
-    if values is None:
-        return f"as many as {name!r}"
-    return len(values)
-
-
-def check_dtype(info: FileInfo, issues: IssueCollector) -> bool:
-    """Check that positions are float32 and not packed as scaled numbers."""
-    array = info.arrays.get("position")
-    if array is None:
-        issues.skip("there is no variable 'position'", "dtype")
-        return False
-    issues.complete("dtype")
-    where = "variable 'position'"
-    if array.kind != "float32":
+    if position.kind != "float32":
         issues.error(
             "dtype",
-            "the type is another",
+            f"positions are {position.kind}; store float32: "
+            "positions.astype('float32')",
             where=where,
-            expected="float32",
-            got=array.kind,
-            fix="store positions as float32: positions.astype('float32')",
         )
     if info.packing:
-        packing = []
-        for name, value in info.packing.items():
-            packing.append(f"{name} = {describe_value(value)}")
         issues.error(
             "dtype",
-            "the values are packed, and are not unpacked here",
+            f"{', '.join(info.packing)}: packed values are not unpacked here; store "
+            "the positions themselves as float32",
             where=where,
-            expected="no scale_factor and no add_offset",
-            got=", ".join(packing),
-            fix="store the positions themselves as float32",
         )
-    return not issues.first_failed("dtype")
+    _check_dims(info, position, issues, dimension=dimension)
+    _check_diverged_at(info, issues)
+    has_dims = "dims" not in issues.skipped
+    return is_stored and has_dims and not issues.first_failed("dims", "dtype")
 
 
-def check_diverged_at(info: FileInfo, issues: IssueCollector) -> None:
+def _check_dims(
+    info: FileInfo,
+    position: ArrayInfo,
+    issues: IssueCollector,
+    *,
+    dimension: int | None,
+) -> None:
+    """Check names, order and lengths of the dimensions of ``position``."""
+    shape = position.shape
+    if shape is None or not {"scenario", "frame"} <= info.integers.keys():
+        issues.skip("positions, scenarios or frames cannot be read", "dims")
+        return
+    where = "variable 'position'"
+    if position.dims != DIMS:
+        names = [
+            quote(name) if name else "one without a name" for name in position.dims
+        ]
+        fix = f"the dimensions are {', '.join(DIMS)}, also for a single scenario"
+        if sorted(position.dims) == sorted(DIMS):
+            fix = "transpose it"
+        elif not any(position.dims):
+            fix = "attach dimension scales, as netCDF4 and xarray do, not plain h5py"
+        what = f"dimensions {', '.join(names) or 'none'}, not {', '.join(DIMS)}; {fix}"
+        issues.error("dims", what, where=where)
+        return
+
+    if dimension is None:
+        dimension = shape[3] if shape[3] in SPACES else SPACES[0]
+    scenarios = len(info.integers["scenario"])
+    lengths = (scenarios, len(info.integers["frame"]), shape[2], dimension)
+    if shape != lengths:
+        issues.error("dims", f"shape {shape}, not {lengths}; {WRITE}", where=where)
+        return
+    particles = info.integers.get("particle", ())
+    has_order = list(particles) == list(range(len(particles)))
+    if info.components not in ((), AXES[:dimension]) or not has_order:
+        issues.error(
+            "dims",
+            "components or particles stand in another order; store x, y, z, and "
+            "particles 0, 1, 2 and so on in the order of the given frames",
+            where=where,
+        )
+    counted = info.arrays.get("particle_count")
+    if counted is None:
+        return
+    counts = info.integers.get("particle_count", ())
+    is_per_scenario = counted.dims == ("scenario",) and len(counts) == scenarios
+    if not is_per_scenario or not all(1 <= count <= shape[2] for count in counts):
+        issues.error(
+            "dims",
+            f"not one number from 1 to {shape[2]} per scenario; leave it out where all "
+            "scenarios have as many particles",
+            where="variable 'particle_count'",
+        )
+
+
+def _check_diverged_at(info: FileInfo, issues: IssueCollector) -> None:
     """Check that ``diverged_at``, if any, has a predicted frame or -1 per scenario."""
     array = info.arrays.get("diverged_at")
     if array is None:
-        issues.complete("diverged_at")
         return
     frozen_from = info.integers.get("diverged_at")
     frames = info.integers.get("frame")
     if frozen_from is None or frames is None:
         issues.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
         return
-
-    issues.complete("diverged_at")
     where = "variable 'diverged_at'"
     scenario_count = len(info.integers.get("scenario", ()))
     if array.dims != ("scenario",) or len(frozen_from) != scenario_count:
-        dimension = "one without a name"
-        if any(array.dims):
-            dimension = quote(array.dims[0])
         issues.error(
             "diverged_at",
-            "it is not told per scenario",
+            "not one value per scenario, on the dimension 'scenario'; store it so, or "
+            "leave it out",
             where=where,
-            expected="one value per scenario, on the dimension 'scenario'",
-            got=f"{len(frozen_from)} on {dimension}",
-            fix="store it beside 'scenario', or leave it out",
         )
     wrong_frames = sorted(set(frozen_from) - {NEVER, *frames})
     if wrong_frames:
         issues.error(
             "diverged_at",
-            "a rollout is frozen at no predicted frame",
+            f"{quote(wrong_frames)}: no predicted frames; name the first frozen frame, "
+            f"or {NEVER} for a rollout that did not diverge",
             where=where,
-            expected=f"absolute numbers of predicted frames, {NEVER} for a rollout "
-            f"that did not diverge",
-            got=", ".join(map(str, wrong_frames[:5])),
-            fix=f"name the first frozen frame, or {NEVER}",
         )

@@ -12,7 +12,6 @@ from lagbench.errors import (
     DataError,
     LagbenchError,
     UnreadableFileError,
-    compose_message,
     escape_line,
     format_count,
 )
@@ -49,9 +48,6 @@ All other checks have ChecksFailedError.
 MAX_TEXT = 80
 """Longest piece of a stranger's file that a message repeats [characters]."""
 
-LARGEST_PRINTED_INTEGER = 4 * MAX_TEXT
-"""Length beyond which an integer is described, not printed [bits]."""
-
 
 def quote(value: object) -> str:
     """Return a stranger's value as one short printable line.
@@ -59,18 +55,13 @@ def quote(value: object) -> str:
     >>> quote("dot" * 50)
     "'dotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotdotd..."
     """
-    if isinstance(value, int) and value.bit_length() > LARGEST_PRINTED_INTEGER:
-        return f"an integer of {value.bit_length()} bits"
-
     if isinstance(value, (str, bytes)):
         value = value[: MAX_TEXT + 1]
     try:
         text = ascii(value)
-    except ValueError:  # an integer inside, of more digits than Python prints
+    except ValueError:  # an integer of more digits than Python prints
         return f"a {type(value).__name__}"
-    if not isinstance(value, (str, bytes)):
-        text = " ".join(text.split())  # arrays have several lines
-
+    text = " ".join(text.split())  # arrays have several lines
     if len(text) <= MAX_TEXT:
         return text
     return f"{text[: MAX_TEXT - 3]}..."
@@ -89,21 +80,13 @@ class ValidationIssue:
 
     check: str  # one of CHECKS
     severity: Severity  # errors reject the file, warnings flag it
-    what: str  # what is wrong, one clause
+    what: str  # what is wrong; what to do
     where: str  # variable, attribute, scenario or frame concerned
-    expected: str
-    got: str
-    fix: str
+    share: float | None = None  # of the positions that are concerned, where it counts
 
     def __str__(self) -> str:
-        """Return the issue as lines for people."""
-        return compose_message(
-            f"{self.severity} [{self.check}] {self.what}",
-            where=self.where,
-            expected=self.expected,
-            got=self.got,
-            fix=self.fix,
-        )
+        """Return the issue as a line for people."""
+        return escape_line(f"{self.severity} [{self.check}] {self.where}: {self.what}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,45 +105,35 @@ class ValidationResult:
 
     def __repr__(self) -> str:
         """Return the verdict on the file, and how much is wrong with it."""
-        counts = [
-            format_count(len(self.errors), "error"),
-            format_count(len(self.warnings), "warning"),
-        ]
-        return f"<ValidationResult of {self.path}: {self.verdict}, {', '.join(counts)}>"
+        return f"<ValidationResult of {self.path}: {self._summary}>"
 
     def __str__(self) -> str:
         """Return all issues, the checks that were not made, and the verdict."""
         lines = [str(issue) for issue in self.findings]
-
         skipped_checks: dict[str, list[str]] = {}
         for check, reason in self.skipped.items():
             skipped_checks.setdefault(reason, []).append(check)
         for reason, checks in skipped_checks.items():
-            names = ", ".join(checks)
-            if len(checks) == len(CHECKS) - 1:
-                names = "all other checks"
-            lines.append(f"not made, since {reason}: {names}")
-
-        error_count = format_count(len(self.errors), "error")
-        warning_count = format_count(len(self.warnings), "warning")
-        check_count = format_count(len(self.passed), "check")
-        counts = f"{error_count}, {warning_count}, {check_count} passed"
-        path = escape_line(str(self.path))
-        lines.append(f"{path}: {self.verdict}, {counts}")
+            lines.append(f"not made, since {reason}: {', '.join(checks)}")
+        passed = format_count(len(self.passed), "check")
+        lines.append(f"{escape_line(str(self.path))}: {self._summary}, {passed} passed")
         return "\n".join(lines)
+
+    @property
+    def _summary(self) -> str:
+        errors = format_count(len(self.errors), "error")
+        warnings = format_count(len(self.warnings), "warning")
+        return f"{self.verdict}, {errors}, {warnings}"
 
     @property
     def errors(self) -> tuple[ValidationIssue, ...]:
         """Issues that reject the file."""
-        return self._of_severity(Severity.ERROR)
+        return tuple(one for one in self.findings if one.severity is Severity.ERROR)
 
     @property
     def warnings(self) -> tuple[ValidationIssue, ...]:
         """Issues that flag the file."""
-        return self._of_severity(Severity.WARNING)
-
-    def _of_severity(self, severity: Severity) -> tuple[ValidationIssue, ...]:
-        return tuple(issue for issue in self.findings if issue.severity is severity)
+        return tuple(one for one in self.findings if one.severity is Severity.WARNING)
 
     @property
     def valid(self) -> bool:
@@ -176,17 +149,18 @@ class ValidationResult:
         """
         if self.valid:
             return "valid"
-        failed_checks = {issue.check for issue in self.errors}
-        if failed_checks == {"dataset"}:
+        if all(issue.check == "dataset" for issue in self.errors):
             return "not judged"
         return "not valid"
 
     @property
     def exit_code(self) -> int:
         """0 valid, 3 unreadable, 4 wrong or missing data set, else 1."""
-        if self.valid:
-            return 0
-        return self._error_class().exit_code
+        try:
+            self.check()
+        except LagbenchError as error:
+            return error.exit_code
+        return 0
 
     def check(self) -> None:
         """Raise unless the file is valid.
@@ -202,126 +176,64 @@ class ValidationResult:
         """
         if self.valid:
             return
-        issue = self._deciding_error()
-        path = escape_line(str(self.path))
-        what = f"{path} is {self.verdict}: [{issue.check}] {issue.what}"
-        if len(self.errors) > 1:
-            what += f" (and {len(self.errors) - 1} more)"
-        raise self._error_class()(
-            what,
-            where=issue.where,
-            expected=issue.expected,
-            got=issue.got,
-            fix=issue.fix,
-        )
-
-    def _error_class(self) -> type[LagbenchError]:
-        return ERROR_CLASSES.get(self._deciding_error().check, ChecksFailedError)
-
-    def _deciding_error(self) -> ValidationIssue:
-        """Return the error that decides the class and the message of :meth:`check`."""
+        deciding = self.errors[0]
         for check in ERROR_CLASSES:
-            for issue in self.errors:
-                if issue.check == check:
-                    return issue
-        return self.errors[0]
+            of_check = [issue for issue in self.errors if issue.check == check]
+            if of_check:
+                deciding = of_check[0]
+                break
+        more = ""
+        if len(self.errors) > 1:
+            more = f" (and {len(self.errors) - 1} more)"
+        raise ERROR_CLASSES.get(deciding.check, ChecksFailedError)(
+            f"{self.verdict}: [{deciding.check}] {escape_line(deciding.where)}: "
+            f"{deciding.what}{more}",
+            where=escape_line(str(self.path)),
+        )
 
 
 class IssueCollector:
-    """Collect issues, and note which checks were made and which were skipped."""
+    """Collect issues, and note which checks were skipped."""
 
     def __init__(self) -> None:
-        self._issues: list[ValidationIssue] = []
-        self._completed: set[str] = set()
-        self._skipped: dict[str, str] = {}
-
-    @property
-    def skipped(self) -> Mapping[str, str]:
-        """Checks that could not be made, and why."""
-        return self._skipped
-
-    def complete(self, *checks: str) -> None:
-        """Note that checks were made."""
-        self._completed.update(checks)
+        self.issues: list[ValidationIssue] = []
+        self.skipped: dict[str, str] = {}
 
     def skip(self, reason: str, *checks: str) -> None:
-        """Note that checks could not be made, unless they were."""
+        """Note that checks could not be made; the first reason counts."""
         for check in checks:
-            if check not in self._completed:
-                self._skipped[check] = reason
+            self.skipped.setdefault(check, reason)
 
-    def error(
-        self,
-        check: str,
-        what: str,
-        *,
-        where: str,
-        expected: object,
-        got: object,
-        fix: str,
-        severity: Severity = Severity.ERROR,
-    ) -> None:
-        """Add an issue that rejects the file, or with another severity flags it."""
-        self._completed.add(check)
-        issue = ValidationIssue(
-            check=check,
-            severity=severity,
-            what=what,
-            where=where,
-            expected=str(expected),
-            got=str(got),
-            fix=fix,
+    def error(self, check: str, what: str, *, where: str) -> None:
+        """Add an issue that rejects the file."""
+        self.issues.append(
+            ValidationIssue(
+                check=check, severity=Severity.ERROR, what=what, where=where
+            )
         )
-        self._issues.append(issue)
 
     def warning(
-        self,
-        check: str,
-        what: str,
-        *,
-        where: str,
-        expected: object,
-        got: object,
-        fix: str,
+        self, check: str, what: str, *, where: str, share: float | None = None
     ) -> None:
         """Add an issue that flags the file."""
-        self.error(
-            check,
-            what,
-            where=where,
-            expected=expected,
-            got=got,
-            fix=fix,
-            severity=Severity.WARNING,
+        self.issues.append(
+            ValidationIssue(
+                check=check,
+                severity=Severity.WARNING,
+                what=what,
+                where=where,
+                share=share,
+            )
         )
 
     def add_exception(self, check: str, error: LagbenchError) -> None:
         """Add the issue that one of our exceptions describes; it rejects the file."""
-        expected = error.expected
-        if expected is None:
-            expected = "an undamaged file"
-        got = error.got
-        if got is None:
-            got = "nothing"
-        self.error(
-            check,
-            error.what,
-            where=error.where or "the file",
-            expected=expected,
-            got=got,
-            fix=error.fix or "make it again",
-        )
+        self.error(check, error.text, where=error.where or "the file")
 
     def first_failed(self, *checks: str) -> str | None:
         """Return the first of some checks that has an error; None where none has."""
-        failed_checks = set()
-        for issue in self._issues:
-            if issue.severity is Severity.ERROR:
-                failed_checks.add(issue.check)
-        for check in checks:
-            if check in failed_checks:
-                return check
-        return None
+        failed = {one.check for one in self.issues if one.severity is Severity.ERROR}
+        return next((check for check in checks if check in failed), None)
 
     def result(
         self, path: Path, *, sha256: str | None = None, **names: str
@@ -330,28 +242,23 @@ class IssueCollector:
 
         ``names`` holds the split, the size and the method that the file names.
         """
-        checks_with_issues = {issue.check for issue in self._issues}
+        found = {issue.check for issue in self.issues}
         passed = []
         skipped = {}
         for check in CHECKS:
-            if check in checks_with_issues:
-                continue
-            if check in self._skipped:
-                skipped[check] = self._skipped[check]
-            elif check in self._completed:
+            if check in self.skipped and check not in found:
+                skipped[check] = self.skipped[check]
+            elif check not in found:
                 passed.append(check)
         return ValidationResult(
             path=path,
             split=names.get("split"),
             size=names.get("size"),
             method=names.get("method"),
-            findings=sort_issues(self._issues),
+            findings=tuple(
+                sorted(self.issues, key=lambda issue: CHECKS.index(issue.check))
+            ),
             passed=tuple(passed),
             skipped=skipped,
             sha256=sha256,
         )
-
-
-def sort_issues(issues: list[ValidationIssue]) -> tuple[ValidationIssue, ...]:
-    """Return issues in the order of :data:`CHECKS`."""
-    return tuple(sorted(issues, key=lambda issue: CHECKS.index(issue.check)))

@@ -19,15 +19,10 @@ from lagbench.errors import UsageError
 
 from .format import (
     DIMS,
-    REQUIRED,
+    IDENTITY,
     WRITE,
     FileInfo,
-    Header,
-    check_dims,
-    check_diverged_at,
-    check_dtype,
-    check_format,
-    header_of,
+    check_layout,
     inspect_file,
 )
 from .issues import IssueCollector
@@ -46,7 +41,7 @@ class Predictions:
     ) -> None:
         self.path = path
         self.info = info
-        self.header: Header = header_of(info)
+        self.header = info.header
         self._position = position
         self._stack = stack
         self._row = {}
@@ -81,28 +76,22 @@ class Predictions:
             UsageError: the file has no such scenario or frames.
             UnreadableFileError: the file is damaged there.
         """
-        first = self._index_of(scenario, start, count)
+        numbers = self.header.frames
+        has_start = scenario in self._row and start in numbers
+        first = numbers.index(start) if has_start else 0
+        if not has_start or not 0 <= count <= len(numbers) - first:
+            raise UsageError(
+                f"no {count} frames from {start} of scenario {scenario}; there are "
+                f"scenarios {format_ids(self.header.scenarios)}, frames "
+                f"{format_ids(numbers)}",
+                where=str(self.path),
+            )
         row = self._row[scenario]
         particles = self.header.particle_count(scenario)
         with hdf5_errors(self.path, "position"):
             values: NDArray[Any] = self._position[row, first : first + count]
             values = values[:, :particles]
             return np.ascontiguousarray(values, dtype=np.float32)
-
-    def _index_of(self, scenario: int, start: int, count: int) -> int:
-        """Return the index of a frame after which so many frames are stored."""
-        numbers = self.header.frames
-        if scenario in self._row and start in numbers:
-            first = numbers.index(start)
-            if 0 <= count <= len(numbers) - first:
-                return first
-        raise UsageError(
-            "the file has no such frames",
-            where=str(self.path),
-            expected=f"scenarios {format_ids(self.header.scenarios)}, "
-            f"frames {format_ids(numbers)}",
-            got=f"scenario {scenario}, {count} frames from {start}",
-        )
 
     def blocks(self, scenario: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """Yield a scenario in pieces of about 1 MiB: absolute first frame, positions.
@@ -152,7 +141,7 @@ class Predictions:
         header = self.header
         scenarios = sorted(header.scenarios)
         identity: dict[str, Any] = {}
-        for name in REQUIRED:
+        for name in IDENTITY:
             identity[name] = getattr(header, name)
         identity["scenarios"] = scenarios
         identity["frames"] = list(header.frames)
@@ -187,10 +176,7 @@ def open_predictions(path: str | Path, *, info: FileInfo | None = None) -> Predi
         if info is None or info.length != path.stat().st_size:
             info = inspect_file(file, path)
             issues = IssueCollector()
-            check_format(info, issues)
-            check_dims(info, issues)
-            check_dtype(info, issues)
-            check_diverged_at(info, issues)
+            check_layout(info, issues)
             issues.result(path).check()
         return attach(file, path, info, stack)
 

@@ -1,6 +1,6 @@
-"""The scenarios that predictions are compared with.
+"""The scenarios that predictions are compared with, and what a data set asks for.
 
-They are hashed before use, and read a few frames at a time.
+Scenarios are hashed before use, and read a few frames at a time.
 """
 
 from __future__ import annotations
@@ -13,12 +13,34 @@ from numpy.typing import NDArray
 from lagbench.data.box import Box
 from lagbench.data.layout import format_ids, has_file
 from lagbench.data.local import check_contents, suggest_repair
+from lagbench.data.manifest import read_or_empty
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
 
 BLOCK = 16
 """Frames that are read at a time."""
+
+
+def frames_to_predict(size: Size) -> range:
+    """Return the absolute numbers of the frames that a model must predict."""
+    task = size.task
+    return range(task.input_frames, task.input_frames + task.horizon)
+
+
+def max_test_particles(size: Size) -> int:
+    """Return the most particles of a test scenario."""
+    return max(size.particle_count(scenario) for scenario in size.scored_scenarios)
+
+
+def dataset_hash_of(size: Size, root: Path) -> str | None:
+    """Return the recorded hash of a data set.
+
+    It is the registry's, else that of a complete local data set; None without either.
+    """
+    if size.measured is not None:
+        return size.measured.dataset_sha256
+    return read_or_empty(size, root).dataset_sha256
 
 
 class Truth:
@@ -49,18 +71,12 @@ class Truth:
             ClosedFolderError: their folder may not be read.
         """
         scenarios = self.size.subsets[self.subset]
-        missing = []
-        for scenario in scenarios:
-            if not has_file(self.path(scenario)):
-                missing.append(scenario)
+        missing = [i for i in scenarios if not has_file(self.path(i))]
         if missing:
             raise DataError(
                 f"{len(missing)} of {len(scenarios)} {self.subset} scenarios are not "
-                f"generated",
-                where=str(self.path(scenarios[0]).parent),
-                expected=f"scenarios {format_ids(scenarios)}",
-                got=f"missing: {format_ids(missing)}",
-                fix=self._hint(),
+                f"generated ({format_ids(missing)}); {self._repair}",
+                where=str(self.path(missing[0]).parent),
             )
 
     def check(self) -> None:
@@ -71,10 +87,10 @@ class Truth:
         Raises:
             DataError: a scenario is damaged or not the recorded one.
         """
-        scenarios = self.size.subsets[self.subset]
-        check_contents(self.size, self.root, scenarios)
+        check_contents(self.size, self.root, self.size.subsets[self.subset])
 
-    def _hint(self) -> str:
+    @property
+    def _repair(self) -> str:
         return suggest_repair(self.size, f"--subset {self.subset}", root=self.root)
 
     def open(self, scenario: int) -> ScenarioFile:
@@ -84,29 +100,23 @@ class Truth:
             DataError: the file says that it is another scenario.
         """
         path = self.path(scenario)
-        key = self.size.key(scenario)
         file = read_scenario(path)
-        header = file.header
-        identity = (
-            header.key.split,
-            header.key.size,
-            header.key.major,
-            header.key.scenario,
+        stated = file.header.key
+        key = self.size.key(scenario)
+        is_same = (stated.split, stated.size, stated.major, stated.scenario) == (
+            key.split,
+            key.size,
+            key.major,
+            scenario,
         )
-        expected_identity = (key.split, key.size, key.major, scenario)
-        expected_hash = self.size.registered_hash(scenario)
-        if identity == expected_identity and header.content_sha256.startswith(
-            expected_hash
-        ):
+        recorded_hash = self.size.registered_hash(scenario)
+        if is_same and file.header.content_sha256.startswith(recorded_hash):
             return file
-
         file.close()
         raise DataError(
-            f"a {self.subset} scenario is not that of the registry",
+            f"not the {self.subset} scenario {scenario} of the registry; "
+            f"{self._repair}",
             where=str(path),
-            expected=f"{expected_identity}, content hash {expected_hash or 'any'}",
-            got=f"{identity}, content hash {header.content_sha256[:16]}",
-            fix=self._hint(),
         )
 
     def given_frames(self, scenario: int) -> NDArray[np.float32]:
@@ -116,30 +126,17 @@ class Truth:
         """
         return self.frames(scenario, 0, self.size.task.input_frames)
 
-    def frames_around_start(self, scenario: int) -> NDArray[np.float32]:
-        """Return the last given frame and the first two to predict, or the only one.
-
-        Positions [length], shape [2 or 3, particle, space].
-        """
-        task = self.size.task
-        first_to_predict = task.input_frames
-        stop = first_to_predict + min(2, task.horizon)
-        return self.frames(scenario, first_to_predict - 1, stop)
-
     def frames(self, scenario: int, start: int, stop: int) -> NDArray[np.float32]:
         """Return some positions [length], shape [frame, particle, space]."""
         with self.open(scenario) as file:
             frames: NDArray[np.float32] = file.read("position", slice(start, stop))
         particles = self.size.particle_count(scenario)
-        if frames.shape != (stop - start, particles, self.size.dimension):
+        expected = (stop - start, particles, self.size.dimension)
+        if frames.shape != expected:
             raise DataError(
-                f"a {self.subset} scenario has other frames or particles than the "
-                f"registry says",
+                f"frames {start} to {stop - 1} have shape {frames.shape}, not "
+                f"{expected}; make the data again",
                 where=str(self.path(scenario)),
-                expected=f"at least {stop} frames of {particles} particles and "
-                f"{self.size.dimension} components",
-                got=frames.shape,
-                fix="make the data again; lagbench verify names wrong files",
             )
         return frames
 
@@ -149,10 +146,9 @@ class Truth:
         Reading stops as soon as a distance of at least ``enough`` [length] is seen,
         which is then returned.
         """
-        task = self.size.task
         largest = 0.0
         with self.open(scenario) as file:
-            frame_count = min(file.header.frames, task.input_frames + task.horizon)
+            frame_count = min(file.header.frames, frames_to_predict(self.size).stop)
             for start in range(0, frame_count - 1, BLOCK):
                 stop = min(start + BLOCK + 1, frame_count)
                 frames = file.read("position", slice(start, stop))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import operator
 import re
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -19,80 +18,19 @@ from lagbench.atomic import atomic_path, check_output_file, explain_write_error
 from lagbench.data.hdf5 import open_netcdf
 from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.local import locate, suggest_repair
-from lagbench.data.registry import Registry, Size
-from lagbench.errors import (
-    DataError,
-    UsageError,
-    WorkFailedError,
-    format_count,
-    suggest_name,
-)
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.store.copy import update_working_copy
 
-from .format import (
-    ATTRIBUTES,
-    DIMS,
-    FORMAT,
-    NEVER,
-    OPTIONAL,
-    require_valid_attribute,
-)
+from .format import ATTRIBUTES, DIMS, FORMAT, HASH, NEVER, check_labels
 from .issues import quote
-from .task_checks import (
-    HASH,
-    dataset_hash_of,
-    frames_to_predict,
-    max_test_particles,
-)
-from .truth import Truth
+from .truth import Truth, dataset_hash_of, frames_to_predict, max_test_particles
 
 CHUNK_CACHE_BYTES = 1 << 20
 """Memory for the chunks of a variable while it is written [bytes]."""
 
 ADDRESS_SCHEME = re.compile("[A-Za-z][A-Za-z0-9+.-]+:")
 """First part of the path of an address, such as s3://bucket/p.nc."""
-
-MAX_REASON = 200
-"""Longest reason that a message repeats [characters]."""
-
-OTHER_ENDINGS = frozenset(
-    {
-        ".pth",
-        ".ckpt",
-        ".safetensors",
-        ".onnx",
-        ".pkl",
-        ".pickle",
-        ".json",
-        ".yaml",
-        ".yml",
-        ".toml",
-        ".csv",
-        ".txt",
-        ".md",
-        ".html",
-        ".h5",
-        ".hdf5",
-        ".npz",
-        ".npy",
-        ".zarr",
-        ".parquet",
-        ".mat",
-        ".vtk",
-        ".png",
-        ".jpg",
-        ".svg",
-        ".pdf",
-        ".gif",
-        ".mp4",
-        ".zip",
-        ".tar",
-        ".gz",
-        ".py",
-        ".ipynb",
-    }
-)
-"""Endings of names that no netCDF file has."""
 
 Label = str | int | float
 """Value of an optional attribute."""
@@ -143,22 +81,26 @@ class PredictionsWriter:
     ) -> None:
         self.path = expand_home(path, option)
         self._option = option
-        _refuse_address(self.path, option)
-        check_output_file(self.path, overwrite=True, option=option)
+        check_predictions_output(self.path, overwrite=True, option=option)
         tier, folder, _ = locate(split, size, root=root, registry=registry)
         self.size = tier.scored_on(subset)
         if dataset_sha256 is None:
-            dataset_sha256 = _recorded_hash(self.size, folder)
+            if self.size.measured is None:
+                update_working_copy(self.size, folder)
+            dataset_sha256 = dataset_hash_of(self.size, folder)
+        if dataset_sha256 is None:
+            raise DataError(
+                f"neither {self.size.record_name} nor a complete data set here has the "
+                f"hash of the data; {suggest_repair(self.size, root=folder)}, or give "
+                "dataset_sha256",
+                where=f"{self.size.split} {self.size.name}",
+            )
         if not isinstance(dataset_sha256, str) or not HASH.fullmatch(dataset_sha256):
             raise UsageError(
-                "dataset_sha256 does not fit",
+                f"64 hex digits, as `lagbench info` prints them, got "
+                f"{quote(dataset_sha256)}; leave it out where a hash is recorded",
                 where="dataset_sha256",
-                expected="64 hex digits",
-                got=quote(dataset_sha256),
-                fix="copy it from `lagbench info`, or leave it out where the data set "
-                "has a recorded hash",
             )
-        require_valid_attribute("method", method)
         self._dataset_sha256 = dataset_sha256
         self._variables = ("position", "velocity") if velocity else ("position",)
         self._row_of: dict[int, int] = {}
@@ -167,10 +109,10 @@ class PredictionsWriter:
         self._is_open = False
         self._written: set[int] = set()
         self._diverged_at = np.full(len(self._row_of), NEVER, np.int32)
-        self._labels: dict[str, Label] = {"method": method}
+        self._labels: dict[str, Label] = {}
+        self.label(method=method, **labels)
         if subset != "test":
             self._labels["subset"] = subset
-        self.label(**labels)
 
     def shape_of(self, scenario: int) -> tuple[int, int, int]:
         """Return the shape of a scenario: frames to predict, particles, components."""
@@ -194,30 +136,18 @@ class PredictionsWriter:
         Raises:
             UsageError: there is no such label, or it cannot have that value.
         """
+        plain_labels = {}
         for name, value in labels.items():
-            if isinstance(value, np.generic):
-                value = value.item()
-            if name not in OPTIONAL or name == "subset":
-                raise UsageError(
-                    f"no label {name!r}",
-                    where=f"label {quote(name)}",
-                    expected=", ".join(OPTIONAL),
-                    got=quote(name),
-                    fix=suggest_name(name, OPTIONAL),
-                )
-            require_valid_attribute(name, value)
-            self._labels[name] = value
+            plain_labels[name] = (
+                value.item() if isinstance(value, np.generic) else value
+            )
+        check_labels(plain_labels)
+        self._labels |= plain_labels
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the predictions."""
         if self._is_open:
-            raise UsageError(
-                "the file is being written",
-                where=str(self.path),
-                expected="a writer that is not open",
-                got="an open one",
-                fix="enter a writer once",
-            )
+            raise UsageError("enter a writer once", where=str(self.path))
         self._written.clear()
         self._diverged_at.fill(NEVER)
         with ExitStack() as stack:
@@ -279,32 +209,51 @@ class PredictionsWriter:
         """
         if not self._is_open:
             raise UsageError(
-                "no file is open",
+                "no file is open; with PredictionsWriter(...) as writer:",
                 where=str(self.path),
-                expected="a call within its with block",
-                got="a writer that is closed or was not entered",
-                fix="with PredictionsWriter(...) as writer:",
             )
-        scenario = self._check_scenario(scenario)
+        number = None
+        with suppress(TypeError, ValueError, RuntimeError):
+            number = operator.index(np.asarray(scenario)[()])
+        if number is None or number not in self._row_of:
+            raise UsageError(
+                f"no such scenario; give ids, not rows: {format_ids(self._row_of)}",
+                where=f"scenario {quote(scenario)}",
+            )
+        where = f"scenario {number}"
+        if number in self._written:
+            raise UsageError("a scenario is written once", where=where)
         arrays = {"position": position}
         if velocity is not None:
             arrays["velocity"] = velocity
         if len(arrays) != len(self._variables):
             raise UsageError(
-                "velocities come for every scenario or for none",
-                where=f"scenario {scenario}",
-                expected=" and ".join(self._variables),
-                got=" and ".join(arrays),
-                fix="leave velocities out: they are not scored; or give velocity=True "
-                "to the writer and velocities of every scenario",
+                "velocities come for every scenario, with velocity=True, or for none",
+                where=where,
             )
         values = {}
         for name, array in arrays.items():
-            values[name] = self._check_values(name, scenario, array)
-        if diverged_at is not None:
-            self._check_frozen(scenario, values["position"], diverged_at)
+            values[name] = self._check_values(name, number, array)
 
-        row = self._row_of[scenario]
+        if diverged_at is not None:
+            frames = frames_to_predict(self.size)
+            where = f"diverged_at of {where}"
+            is_whole = isinstance(diverged_at, int | np.integer)
+            if not is_whole or diverged_at not in frames:
+                raise UsageError(
+                    f"no predicted frame, but {quote(diverged_at)}; give the absolute "
+                    f"number of the first frozen frame: {format_ids(frames)}",
+                    where=where,
+                )
+            frozen = values["position"][frames.index(diverged_at) :]
+            if (frozen != frozen[:1]).any():
+                raise UsageError(
+                    f"the rollout moves after frame {diverged_at}; freeze it at its "
+                    "last finite frame",
+                    where=where,
+                )
+
+        row = self._row_of[number]
         with self._writing():
             for name, array in values.items():
                 # Particles that the scenario does not have are padding.
@@ -313,60 +262,7 @@ class PredictionsWriter:
                 self._file[name][row] = padded
         if diverged_at is not None:
             self._diverged_at[row] = diverged_at
-        self._written.add(scenario)
-
-    def _check_scenario(self, scenario: object) -> int:
-        """Return the id; refuse a scenario that is unknown or written already."""
-        where = f"scenario {quote(scenario)}"
-        expected = f"whole numbers: {format_ids(self._row_of)}"
-        number = _whole_number(scenario)
-        if number in self._written:
-            raise UsageError(
-                "a scenario is written twice",
-                where=where,
-                expected=expected,
-                got=f"{number} once more",
-                fix="add every scenario once, with all of its frames",
-            )
-        if number is None or number not in self._row_of:
-            raise UsageError(
-                "no such scenario in the subset",
-                where=where,
-                expected=expected,
-                got=repr(scenario)[:80],
-                fix="name scenarios by id, not by row; for shift, state the subset",
-            )
-        return number
-
-    def _check_frozen(
-        self, scenario: int, position: NDArray[np.float32], diverged_at: int
-    ) -> None:
-        """Refuse a rollout that moves after the frame from which it is frozen."""
-        frames = frames_to_predict(self.size)
-        where = f"diverged_at of scenario {scenario}"
-        is_whole = isinstance(diverged_at, int | np.integer)
-        if not is_whole or diverged_at not in frames:
-            raise UsageError(
-                "no such frame is predicted",
-                where=where,
-                expected=f"a whole number, {format_ids(frames)}",
-                got=repr(diverged_at)[:80],
-                fix="give the absolute number of the first frozen frame; frame 0 is "
-                "the first given one",
-            )
-        first_frozen = frames.index(diverged_at)
-        frozen = position[first_frozen:]
-        has_moved = (frozen != frozen[:1]).any(axis=(1, 2))
-        moved_frames = np.flatnonzero(has_moved)
-        if moved_frames.size:
-            first_moved = frames[first_frozen + int(moved_frames[0])]
-            raise UsageError(
-                "the rollout moves after it was frozen",
-                where=where,
-                expected=f"the same positions from frame {diverged_at} on",
-                got=f"frame {first_moved} differs",
-                fix="freeze a diverging rollout at its last finite frame",
-            )
+        self._written.add(number)
 
     def __exit__(
         self,
@@ -385,12 +281,9 @@ class PredictionsWriter:
             missing = sorted(set(self._row_of) - self._written)
             if missing:
                 raise UsageError(
-                    f"{format_count(len(missing), 'test scenario')} missing",
+                    f"scenarios {format_ids(missing)} are missing; predict every test "
+                    "scenario",
                     where=str(self.path),
-                    expected=format_ids(self._row_of),
-                    got=f"missing: {format_ids(missing)}",
-                    fix="predict every test scenario; `lagbench template` writes a "
-                    "file to fill",
                 )
             with self._writing():
                 if (self._diverged_at != NEVER).any():
@@ -416,30 +309,18 @@ class PredictionsWriter:
             array = numbers.astype(np.float32)
         expected_shape = self.shape_of(scenario)
         if array.shape != expected_shape:
-            fix = (
-                "predict all frames and all particles of the scenario: "
-                "frame, particle, space"
-            )
-            if sorted(array.shape) == sorted(expected_shape):
-                fix = "transpose it: frame, particle, space"
             raise UsageError(
-                "the array has the wrong shape",
+                f"shape {array.shape}; give {expected_shape}: frame, particle, space",
                 where=where,
-                expected=expected_shape,
-                got=array.shape,
-                fix=fix,
             )
         bad_places = np.argwhere(~np.isfinite(array))
         if len(bad_places):
             step, particle, axis = bad_places[0].tolist()
             frame = self.size.task.input_frames + step
             raise UsageError(
-                f"{format_count(len(bad_places), 'value')} not finite as float32",
+                f"{array[step, particle, axis]} is not finite as float32; freeze a "
+                "diverging rollout at its last finite frame and give diverged_at",
                 where=f"{where}, frame {frame}, particle {particle}",
-                expected="finite positions",
-                got=array[step, particle, axis],
-                fix="freeze a diverging rollout at its last finite frame and give "
-                "diverged_at",
             )
         return array
 
@@ -476,71 +357,19 @@ class PredictionsWriter:
             raise explain_write_error(self.path, error, option=self._option) from error
 
 
-def _refuse_address(path: Path, option: str) -> None:
-    """Refuse an address, whose name a local folder would get."""
-    parts = path.parts
-    if len(parts) < 2 or not ADDRESS_SCHEME.fullmatch(parts[0]):
-        return
-    raise UsageError(
-        "predictions are written to this machine only",
-        where=option,
-        expected="the path of a file",
-        got=f"{path}, an address",
-        fix=f"write {shlex.quote(path.name)}, then copy it there",
-    )
-
-
-def _recorded_hash(size: Size, root: Path) -> str:
-    """Return the recorded hash of a data set.
-
-    Raises:
-        DataError: none is recorded.
-    """
-    if size.measured is None:
-        update_working_copy(size, root)
-    recorded = dataset_hash_of(size, root)
-    if recorded is None:
-        raise DataError(
-            "the hash of the data set is not known",
-            where=f"{size.split} {size.name}",
-            expected=f"a hash in {size.record_name}, or a complete data set here",
-            got="neither",
-            fix=f"{suggest_repair(size, root=root)}, or give dataset_sha256",
-        )
-    return recorded
-
-
-def _whole_number(value: object) -> int | None:
-    """Return a whole number, also that of an array without dimensions; None if not."""
-    try:
-        return operator.index(np.asarray(value)[()])
-    except (TypeError, ValueError, RuntimeError):
-        return None
-
-
 def _numbers_of(values: ArrayLike, where: str) -> NDArray[Any]:
     """Return values as an array; refuse what is masked or no number."""
     try:
         array = np.asanyarray(values)
-    except (ValueError, TypeError, RuntimeError) as error:
-        # ragged lists, tensors with gradients
-        raise _no_positions(where, f"{type(values).__name__}: {error}") from error
-    if np.ma.is_masked(array):
-        raise _no_positions(where, "masked values")
-    if array.dtype.kind not in "fiu":
-        raise _no_positions(where, f"values of type {array.dtype}")
+    except (ValueError, TypeError, RuntimeError):  # ragged, tensors with gradients
+        array = np.array(None)
+    if np.ma.is_masked(array) or array.dtype.kind not in "fiu":
+        raise UsageError(
+            f"{type(values).__name__} is no array of numbers without a mask; of a "
+            "tensor: tensor.detach().float().cpu().numpy()",
+            where=where,
+        )
     return np.asarray(array)
-
-
-def _no_positions(where: str, got: str) -> UsageError:
-    return UsageError(
-        "these are no positions",
-        where=where,
-        expected="an array of numbers without a mask",
-        got=got[:MAX_REASON],
-        fix="convert it to one NumPy array of float32; of a tensor: "
-        "tensor.detach().float().cpu().numpy()",
-    )
 
 
 def write(
@@ -606,8 +435,14 @@ def write(
     position_of = _by_scenario(positions, scenarios)
     velocity_of = {} if velocities is None else _by_scenario(velocities, scenarios)
     frozen_from = diverged_at or {}
-    _require_test_scenarios("velocities", velocity_of, scenarios)
-    _require_test_scenarios("diverged_at", frozen_from, scenarios)
+    for name, known in (("velocities", velocity_of), ("diverged_at", frozen_from)):
+        unknown = [scenario for scenario in known if scenario not in scenarios]
+        if unknown:
+            raise UsageError(
+                f"no test scenarios: {quote(unknown)}; give ids, not rows: "
+                f"{format_ids(scenarios)}",
+                where=name,
+            )
     with writer:
         for scenario, position in position_of.items():
             writer.add(
@@ -628,32 +463,11 @@ def _by_scenario(
     array = _numbers_of(values, "positions or velocities")
     if array.ndim != len(DIMS) or len(array) != len(scenarios):
         raise UsageError(
-            "the array does not hold one entry per test scenario",
+            f"shape {array.shape}; give all {len(scenarios)} test scenarios in one "
+            "array of 4 dimensions, or a mapping of id to array",
             where="positions or velocities",
-            expected=f"{len(scenarios)} scenarios ({format_ids(scenarios)}) first, "
-            f"{len(DIMS)} dimensions",
-            got=f"shape {array.shape}",
-            fix="give all test scenarios in one array, or a mapping of scenario id to "
-            "array",
         )
     return dict(zip(scenarios, array, strict=True))
-
-
-def _require_test_scenarios(
-    name: str, values: Mapping[int, object], scenarios: list[int]
-) -> None:
-    unknown = []
-    for scenario in values:
-        if scenario not in scenarios:
-            unknown.append(scenario)
-    if unknown:
-        raise UsageError(
-            "no such test scenario",
-            where=name,
-            expected=format_ids(scenarios),
-            got=", ".join(map(quote, unknown[:5])),
-            fix="name scenarios by id, not by row",
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -672,28 +486,26 @@ class TemplateResult:
     bytes: int
 
 
-def check_predictions_output(output: Path, *, overwrite: bool) -> None:
+def check_predictions_output(
+    output: Path, *, overwrite: bool, option: str = "--output"
+) -> None:
     """Refuse, before the work, a file that predictions must not be written to.
 
     Args:
-        output: the file that ``--output`` names.
+        output: the file.
         overwrite: whether the user allows to replace predictions of that name.
+        option: the option or argument that names it, for messages.
 
     Raises:
-        UsageError: it is an address, a folder or a file of another kind, there are such
-            predictions, or its name has the ending of another format.
+        UsageError: it is an address, whose name a local folder would get, a folder, or
+            there are such predictions.
     """
-    _refuse_address(output, "--output")
-    check_output_file(output, overwrite=overwrite)
-    ending = output.suffix
-    if ending.lower() in OTHER_ENDINGS:
+    if len(output.parts) > 1 and ADDRESS_SCHEME.fullmatch(output.parts[0]):
         raise UsageError(
-            "the name has the ending of another format",
-            where="--output",
-            expected="netCDF: a name that ends in .nc or has no ending",
-            got=str(output),
-            fix=f"-o {shlex.quote(str(output.with_suffix('.nc')))}",
+            f"{output} is an address; write {output.name}, then copy it there",
+            where=option,
         )
+    check_output_file(output, overwrite=overwrite, option=option)
 
 
 def template(

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import json
-import pickle
-import re
 import shutil
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
 import pytest
-from command_line import Result
 from score_bench import ScoreBench, half_right, still, straight
 
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.metrics import differ
-from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.compare import compare
-from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.front import digits
 from lagbench.scoring.tables import (
     card_tables,
-    comparison_lines,
     comparison_tables,
-    flag_lines,
 )
 
 Folders = dict[str, Path]
@@ -113,8 +106,7 @@ def test_six_wins_of_six_are_significant(tmp_path: Path) -> None:
     assert metric.first == pytest.approx(21 / 6)
     assert metric.second == pytest.approx(28 / 6)
     assert result.seeds == (1, 1)
-    beginning = "mse_avg: a is better (p = 0.0312, 6 scenarios, one seed each"
-    assert result.verdict.startswith(beginning)
+    assert result.verdict.startswith("mse_avg: a is better (p = 0.0312")
     assert compare(b, a).verdict == result.verdict
     assert result.verdict in repr(result)
 
@@ -125,14 +117,6 @@ def test_six_wins_of_six_are_significant(tmp_path: Path) -> None:
     assert row["difference"] == pytest.approx(row["first"] - row["second"])
     assert row["low"] < row["difference"] < row["high"]
     assert row["significant"]
-
-
-def test_a_comparison_can_be_pickled(tmp_path: Path) -> None:
-    """Its metrics of lagbench come back as the same objects."""
-    a = publish(tmp_path, [1, 2, 3, 4, 5, 6], method="a")
-    b = publish(tmp_path, [2, 3, 4, 5, 6, 8], method="b")
-    result = compare(a, b)
-    assert pickle.loads(pickle.dumps(result)) == result
 
 
 def test_five_wins_of_six_are_not_significant(tmp_path: Path) -> None:
@@ -183,82 +167,44 @@ def test_a_value_that_saturates_is_read_again(tmp_path: Path) -> None:
     assert metric.first == pytest.approx(greatest / 3)
 
 
-def assert_refused_on_either_side(folder: Path, other: Path) -> None:
-    """Assert that a folder of seeds cannot be compared, and that the error names it."""
-    for first, second in ((folder, other), (other, folder)):
-        with pytest.raises(UsageError) as caught:
-            compare(first, second)
-        assert str(folder) in str(caught.value)
+OTHER_IDS = {"task": {"scenarios": list(range(100, 106))}}
+UNLIKE: list[tuple[dict[str, Any], type[Exception]]] = [
+    ({"split": "fluid"}, UsageError),
+    ({"size": "mini"}, UsageError),
+    ({"dataset_sha256": "1" * 64}, DataError),
+    (OTHER_IDS, UsageError),
+]
 
 
-def test_copies_are_no_seeds(tmp_path: Path) -> None:
-    """One file three times is one training."""
-    other = publish(tmp_path, TWOS, method="other")
-    copies = publish_seeds(
-        tmp_path / "copies",
-        [ONES, ONES, ONES],
-        "a",
-        predictions_sha256="a",
-    )
-    assert_refused_on_either_side(copies, other)
-
-
-def test_a_folder_of_two_methods_is_refused(tmp_path: Path) -> None:
-    """The mean of two methods is that of neither."""
-    other = publish(tmp_path, TWOS, method="other")
-    mixed = publish_seeds(tmp_path / "mixed", [ONES], "a")
-    publish(mixed, ONES, method="b")
-    assert_refused_on_either_side(mixed, other)
-
-
-def test_seeds_of_other_scenarios_are_refused(tmp_path: Path) -> None:
-    """A mean over seeds pairs them by scenario: of two subsets there is none."""
-    other = publish(tmp_path, TWOS, method="other")
-    ids = {"task": {"scenarios": list(range(100, 106))}}
-    rows = (ONES, ONES[:4], ONES)
-    for name, number, changes in (("fewer", 1, {}), ("others", 2, ids)):
-        seeds = publish_seeds(tmp_path / name, [ONES], "a")
-        path = publish(
-            seeds, rows[number], method="a", **({"predictions_sha256": "b"} | changes)
-        )
-        assert_refused_on_either_side(seeds, other)
-        assert path.exists()
-
-
-def test_the_table_of_means_counts_undefined_frames(tmp_path: Path) -> None:
-    """A mean over few frames is no merit."""
-    rows = rows_of(ONES, undefined=[0, 0, 0, 0, 12, 7])
-    a = publish(tmp_path, ONES, method="a", rows=rows)
-    b = publish(tmp_path, TWOS, method="b")
-    result = compare(a, b)
-    metric = result.metrics["mse_avg"]
-    assert metric.undefined == (19, 0)
-    tables = {table.title: table for table in comparison_tables(result)}
-    (row,) = tables["means"].rows
-    _, first_cell, second_cell, *_ = row
-    assert first_cell.endswith("†19")
-    assert "†" not in second_cell
+@pytest.mark.parametrize(("changes", "error"), UNLIKE)
+def test_other_data_are_not_compared(
+    tmp_path: Path, changes: dict[str, Any], error: type[Exception]
+) -> None:
+    a = publish(tmp_path, ONES, method="a")
+    b = publish(tmp_path, ONES, method="b", **changes)
+    with pytest.raises(error):
+        compare(a, b)
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "word"),
+    "changes",
     [
-        ({"split": "fluid"}, UsageError, "split"),
-        ({"size": "mini"}, UsageError, "size"),
-        ({"dataset_sha256": "1" * 64}, DataError, "dataset_sha256"),
+        {"predictions_sha256": "a0"},  # one file twice is one training
+        {"method": "b", "predictions_sha256": "b"},
+        {"predictions_sha256": "b", **OTHER_IDS},
     ],
 )
-def test_other_data_are_not_compared(
-    tmp_path: Path,
-    changes: dict[str, str],
-    error: type[Exception],
-    word: str,
+def test_what_is_no_seed_of_a_method_is_refused(
+    tmp_path: Path, changes: dict[str, Any]
 ) -> None:
-    """The error names what differs."""
-    a = publish(tmp_path, ONES, method="a")
-    b = publish(tmp_path, ONES, method="b", **changes)
-    with pytest.raises(error, match=f"differ in {word}"):
-        compare(a, b)
+    """On either side."""
+    other = publish(tmp_path, TWOS, method="other")
+    seeds = publish_seeds(tmp_path / "seeds", [ONES], "a")
+    path = publish(seeds, ONES, method="a")
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    for pair in ((seeds, other), (other, seeds)):
+        with pytest.raises(UsageError):
+            compare(*pair)
 
 
 @pytest.mark.slow
@@ -285,42 +231,19 @@ def test_folders_files_and_predictions_give_the_same_result(
     assert by_predictions.as_json() == expected
 
 
-def test_a_copy_of_a_submission_has_the_same_predictions(
-    scored: Folders, tmp_path: Path
-) -> None:
-    copy = shutil.copytree(scored["still"], tmp_path / "copy")
-    result = compare(scored["still"], copy)
-    assert result.verdict == "both hold the same predictions"
-
-
 def test_the_short_table_leads_with_the_ranking_metric(
     scored: Folders,
 ) -> None:
-    """All metrics come on request."""
+    """All metrics come on request, and none that is unknown."""
     result = compare(scored["still"], scored["straight"])
-    assert next(iter(result.metrics)) == result.ranking
+    assert next(iter(result.metrics)) == result.ranking == "vorticity_nrmse"
     short, means = comparison_tables(result)
     whole, _ = comparison_tables(result, every=True)
-    first_cell = short.rows[0][0]
-    metric, *_ = first_cell.split()
-    assert metric == "vorticity_nrmse"
-    assert len(means.rows) == len(short.rows)
-    assert len(short.rows) < len(whole.rows)
-    assert len(whole.rows) == len(result.metrics)
-
-
-@pytest.fixture
-def board(scored: Folders, tmp_path: Path) -> Path:
-    """A folder of a leaderboard with two seeds of one method."""
-    folder = tmp_path / "scores" / "cavity" / "tiny"
-    folder.mkdir(parents=True)
-    for seed, name in enumerate(("still", "straight")):
-        scores = scored[name] / "scores.nc"
-        path = folder / f"moving_{seed}.nc"
-        shutil.copy(scores, path)
-        with netCDF4.Dataset(path, "a") as file:
-            file.method = "moving"
-    return folder
+    assert len(means.rows) == len(short.rows) < len(whole.rows) == len(result.metrics)
+    result = compare(scored["still"], scored["straight"], metrics=["mse_end"])
+    assert list(result.metrics) == ["vorticity_nrmse", "mse_end"]
+    with pytest.raises(UsageError):
+        compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
 
 
 @pytest.fixture
@@ -348,14 +271,9 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
     swapped = compare(name, scored["still"], board=entries)
     metric = swapped.metrics[swapped.ranking]
     assert metric.side == "better"
-    with pytest.raises(UsageError, match="with itself"):
-        compare(name, "moving", board=entries)
-    with pytest.raises(UsageError, match=name):
-        compare("moving", "persistence", board=entries)
-    with pytest.raises(UsageError, match="no such entry") as caught:
+    assert compare(name, "moving", board=entries).same_predictions
+    with pytest.raises(UsageError):
         compare(f"{name}s", "persistence", board=entries)
-    assert f"did you mean '{name}'" in str(caught.value)
-    assert str(entries) in str(caught.value)
 
 
 WORSE_AND_BETTER = [0.5, 1.5, 1.5, 1.5, 1.5, 1.5]
@@ -393,12 +311,6 @@ def test_rounding_makes_no_method_better(tmp_path: Path) -> None:
     assert side_of(a, c) == "worse"
 
 
-def test_the_verdict_stands_last(scored: Folders, run: Callable[..., Result]) -> None:
-    words = ("compare", scored["still"], scored["straight"])
-    verdict = compare(scored["still"], scored["straight"]).verdict
-    assert run(*words).stdout.splitlines()[-1] == verdict
-
-
 def test_few_scenarios_decide_nothing(tmp_path: Path) -> None:
     """Five scenarios cannot reach 5 %: neither column nor verdict claims anything."""
     a = publish(tmp_path, ONES[:5], method="a")
@@ -406,24 +318,9 @@ def test_few_scenarios_decide_nothing(tmp_path: Path) -> None:
     assert side_of(a, b) == "too few"
     result = compare(a, b)
     assert result.verdict.startswith("5 scenarios decide nothing")
-    text = "\n".join(comparison_lines(result))
-    assert "too few" in text
     # scenarios in which both have equal values are the same, however few
     c = publish(tmp_path, ONES[:5], method="c")
     assert side_of(a, c) == "same"
-
-
-def test_lines_explain_only_what_the_tables_show(tmp_path: Path) -> None:
-    a = publish(tmp_path, ONES, method="a")
-    b = publish(tmp_path, TWOS, method="b")
-    lines = list(comparison_lines(compare(a, b)))
-    assert len(lines) == 2
-    c = publish(tmp_path, WORSE_AND_BETTER, method="c")
-    rows = rows_of(ONES, undefined=[2, 0, 0, 0, 0, 0])
-    d = publish(tmp_path, ONES, method="d", rows=rows)
-    _, _, undefined, chance = comparison_lines(compare(d, c))
-    assert undefined.startswith("†")
-    assert chance.startswith("?")
 
 
 def test_scores_nc_has_the_best_reference(scored: Folders) -> None:
@@ -434,23 +331,6 @@ def test_scores_nc_has_the_best_reference(scored: Folders) -> None:
     from_folder = compare(folder, "constant-velocity").as_json()
     nrmse = from_folder["metrics"]["vorticity_nrmse"]
     assert from_file["metrics"] == {"vorticity_nrmse": nrmse}
-
-
-def test_a_method_that_a_terminal_would_obey_is_unreadable(board: Path) -> None:
-    path = board / "moving_1.nc"
-    with netCDF4.Dataset(path, "a") as file:
-        file.method = "moving\x1b[2J"
-    with pytest.raises(UnreadableFileError) as caught:
-        compare(path, "constant-velocity")
-    assert str(path) in str(caught.value)
-
-
-def test_a_truncated_file_is_unreadable(board: Path) -> None:
-    path = board / "moving_1.nc"
-    content = path.read_bytes()
-    path.write_bytes(content[:9000])
-    with pytest.raises(UnreadableFileError):
-        compare(path, "constant-velocity")
 
 
 @pytest.fixture
@@ -486,23 +366,6 @@ def test_a_reference_is_as_good_as_its_submission(scored: Folders) -> None:
     assert by_file["second"] == "straight"
 
 
-def test_a_misspelt_metric_or_reference_is_refused(scored: Folders) -> None:
-    first = scored["still"]
-    second = scored["straight"]
-    with pytest.raises(UsageError) as caught:
-        compare(first, second, metrics=["vorticity_rsme"])
-    assert "metric" in str(caught.value)
-    with pytest.raises(UsageError):
-        compare(first, "constant-velocty")
-
-
-def test_chosen_metrics_come_after_the_ranking_metric(scored: Folders) -> None:
-    first = scored["still"]
-    second = scored["straight"]
-    result = compare(first, second, metrics=["mse_end"])
-    assert list(result.metrics) == ["vorticity_nrmse", "mse_end"]
-
-
 def test_two_submissions_of_one_method_are_numbered(tmp_path: Path) -> None:
     a = publish(
         tmp_path / "a",
@@ -525,17 +388,6 @@ def test_two_submissions_of_one_method_are_numbered(tmp_path: Path) -> None:
     assert means.columns[1:] == ("toy (1)", "toy (2)")
 
 
-def test_a_reference_keeps_its_name(tmp_path: Path) -> None:
-    """A submission that borrows its name is numbered."""
-    rows = rows_of(ONES)
-    rows["floor"] = rows["submission"]
-    path = publish(tmp_path, ONES, method="floor", rows=rows)
-    result = compare(path, "floor")
-    assert result.first == "floor (1)"
-    assert result.second == "floor"
-    assert not result.namesakes
-
-
 INFINITE = float("inf")
 
 
@@ -556,27 +408,15 @@ def scenario_ids(*ids: object) -> dict[str, Any]:
 
 ENERGY = {"values": ONES, "undefined": [0] * 6}
 MALFORMED: dict[str, dict[str, Any]] = {
-    "a number beyond float64": first_value(10**400),
     "an infinite value": first_value(INFINITE),
-    "a boolean as value": first_value(True),
-    "infinitely many undefined frames": undefined_frames(*[INFINITE] * 6),
-    "undefined frames of one scenario": undefined_frames(0),
-    "ids that occur twice": scenario_ids(*[28] * 6),
     "ids that descend": scenario_ids(5, 4, 3, 2, 1, 0),
     "no scenarios": {"task": {"scenarios": []}, "rows": rows_of([])},
-    "an id that is no integer": scenario_ids(0, 1, 2, 3, 4, 5.5),
-    "an id that is text": scenario_ids("a"),
     "fewer ids than values": scenario_ids(3),
-    "booleans as ids": {
-        "task": {"scenarios": [False, True]},
-        "rows": rows_of([1.0, 2.0]),
-    },
     "an observable that ranks": {
         "ranking_metric": "energy_true",
         "rows": {"submission": {"energy_true": ENERGY}},
     },
     "a name that is no text": {"method": 5},
-    "a name with an escape": {"method": "\x1b[31m"},
     "rows in a list": {"rows": [1]},
     "no rows": {"rows": []},
     "a layout of its own": {"lagbench_scores": 2},
@@ -596,15 +436,6 @@ def test_malformed_scores_are_unreadable(
         compare(good, bad)
     with pytest.raises(UnreadableFileError):
         compare(bad, good)
-
-
-def test_a_folder_without_scores_is_unreadable(tmp_path: Path) -> None:
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    good = publish(tmp_path, ONES, method="good")
-    with pytest.raises(UnreadableFileError) as caught:
-        compare(good, empty)
-    assert str(empty) in str(caught.value)
 
 
 def test_rows_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
@@ -630,16 +461,6 @@ def row_name(row: Sequence[str]) -> str:
     return name
 
 
-def test_the_cost_is_that_of_the_predictions(bench: ScoreBench, tmp_path: Path) -> None:
-    """The score measures no cost: the line names the machine, and who says so."""
-    labels = {"seconds_per_frame": 0.25, "device": "a laptop, 2 threads"}
-    path = bench.submit(tmp_path / "predictions.nc", still, **labels)
-    text = "\n".join(flag_lines(bench.evaluate(path)))
-    (cost,) = [line for line in text.splitlines() if line.startswith("cost:")]
-    assert "0.25 s" in cost
-    assert "'a laptop, 2 threads'" in cost
-
-
 def test_tables_show_references_undefined_frames_and_units(
     half_right_card: ScoreCard,
 ) -> None:
@@ -657,78 +478,3 @@ def test_tables_show_references_undefined_frames_and_units(
     assert at_frames.columns == ("metric", "15", "25")
     scenarios = [row[0] for row in per_scenario.rows]
     assert scenarios == ["3", "4"]
-
-
-def test_the_whole_table_shows_all_metrics_and_references(
-    half_right_card: ScoreCard,
-) -> None:
-    card = half_right_card
-    whole, *_ = card_tables(card, every=True, all_references=True)
-    names = [row_name(row) for row in whole.rows]
-    assert names == ["skill", *card.submission]
-    assert len(whole.columns) == len(card.scores) + 1
-
-
-def test_lines_below_the_tables_state_flags_and_undefined_frames(
-    half_right_card: ScoreCard,
-) -> None:
-    lines = flag_lines(half_right_card)
-    text = "\n".join(lines)
-    assert re.search("^flag copy_suspect: raised", text, re.MULTILINE)
-    assert "2 scenarios: no p-value" in text
-    assert "vorticity_pearson 20" in text
-
-
-def test_lines_count_the_undefined_frames_of_every_metric_shown(
-    half_right_card: ScoreCard,
-) -> None:
-    """Each mark of the whole table has its number in the line that explains marks."""
-    name = "vorticity_mae"
-    assert name not in half_right_card.chosen_metrics
-    score = replace(half_right_card.submission[name], undefined=(3, 0))
-    submission = {**half_right_card.submission, name: score}
-    card = replace(half_right_card, scores={SUBMISSION: submission}, skill=None)
-    whole, *_ = card_tables(card, every=True)
-    marked_names = {row_name(row) for row in whole.rows if row[1].endswith("†")}
-    assert name in marked_names
-    (line,) = [line for line in flag_lines(card, every=True) if line.startswith("†")]
-    _, _, counts = line.partition(": ")
-    assert {count.split()[0] for count in counts.split(", ")} == marked_names
-
-
-@pytest.mark.parametrize(
-    ("predict", "row", "word"),
-    [
-        (straight, 0, "better"),
-        (still, 1, "worse"),
-    ],
-)
-def test_lines_say_how_much_better_a_submission_is(
-    bench: ScoreBench,
-    tmp_path: Path,
-    predict: Any,
-    row: int,
-    word: str,
-) -> None:
-    """The number is the size of the difference, and the word its sign."""
-    path = bench.submit(tmp_path / "predictions.nc", predict)
-    card = bench.evaluate(path)
-    lines = [line for line in flag_lines(card) if line.startswith("against ")]
-    against_persistence = lines[0]
-    is_the_same = against_persistence.endswith("is the same")
-    assert is_the_same == (predict is still)
-
-    pattern = rf"{word} by ([\d.e-]+) \(2 scenarios: no p-value\)"
-    match = re.search(pattern, lines[row])
-    assert match, lines[row]
-    reference = list(card.scores)[1 + row]
-    difference = card.against(reference).difference
-    size = float(match[1])
-    assert size == pytest.approx(abs(difference), rel=1e-3)
-    is_better = difference < 0.0
-    assert is_better == (word == "better")
-
-    # a name that is no reference is refused
-    with pytest.raises(UsageError) as caught:
-        card.against("persistance")
-    assert caught.value.where == "against, row"

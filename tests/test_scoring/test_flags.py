@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -36,7 +35,7 @@ def trace_of(truth: Floats, prediction: Floats, **changes: Any) -> Trace:
     tracer = Tracer(scenario)
     for pair in pairs_of(scenario, truth, prediction):
         tracer.add(pair)
-    return tracer.result()
+    return tracer.trace
 
 
 def make_trace(
@@ -166,7 +165,7 @@ def test_honest_errors_are_no_copies(trace: Trace) -> None:
         (make_trace([0.3, 0.3, 0.3, 0.3, 0.3, 0.3]), "accumulate"),
         (make_trace([1, 2, 3, 4, 5, 6], cosine=0.3), "does not follow"),
         (make_trace([1, 2, 3, 1, 2, 3]), "drops"),
-        (make_trace([0, 0, 0, 0, 0, 0]), "are the truth"),
+        (make_trace([0, 0, 0, 0, 0, 0]), "bit for bit"),
     ],
 )
 def test_copies_raise_the_flag_for_their_own_reason(trace: Trace, reason: str) -> None:
@@ -211,13 +210,6 @@ def test_a_perturbed_run_that_has_lost_the_truth_decides_nothing() -> None:
     assert flag.raised is None
     assert flag.reasons
     assert flag.evidence == {"frames_below": 0.0, "frames_compared": 0.0}
-
-
-def test_a_trace_can_be_pickled() -> None:
-    """Workers send it so."""
-    trace = trace_of(rollout(), rollout(speed=0.012))
-    copied = pickle.loads(pickle.dumps(trace))
-    assert set(copied.shifted) == set(SHIFTS)
 
 
 @pytest.mark.parametrize(
@@ -290,7 +282,7 @@ def trace_scenarios(bench: ScoreBench, predict: Predict) -> list[Trace]:
             for frame, true, predicted in frames:
                 pair = FramePair(scenario, frame, true, predicted)
                 tracer.add(pair)
-            traces.append(tracer.result())
+            traces.append(tracer.trace)
     return traces
 
 
@@ -313,9 +305,3 @@ def test_copies_of_generated_data_raise_the_flag(
     """Predictions that do not use the answer do not raise it."""
     traces = trace_scenarios(bench, predict)
     assert judge_copying(traces).raised == is_copy
-
-
-def test_frames_that_are_the_truth_are_counted(bench: ScoreBench) -> None:
-    half = bench.size.task.horizon // 2
-    for trace in trace_scenarios(bench, half_right):
-        assert analyse_error(trace).exact == half

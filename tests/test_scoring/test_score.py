@@ -5,13 +5,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import pickle
-import re
 import shutil
-import sys
-from collections import Counter
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +15,18 @@ import numpy as np
 import pytest
 from file_size_limit import largest_file
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 from score_bench import ScoreBench, half_right, right, still, straight
 
 from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailedError
 from lagbench.metrics import Direction, FramePair, Metric
 from lagbench.scoring import score as scoring
-from lagbench.scoring.card import ScoreCard, digits
-from lagbench.scoring.published_scores import read_scores
-from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.front import digits
+from lagbench.scoring.published_scores import read_published_scores, read_scores
 from lagbench.scoring.score import scores_folder
-from lagbench.scoring.score_file_checks import read_published_scores
-from lagbench.scoring.tables import flag_lines
+from lagbench.scoring.task import SUBMISSION
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
-from lagbench.submission.predictions import Predictions
 from lagbench.work.run import Progress
 
 
@@ -103,15 +95,6 @@ def test_references_are_what_a_user_would_submit(
         assert_array_equal(score.values, expected.values, err_msg=name)
 
 
-def test_a_score_card_can_be_pickled(persistence_card: ScoreCard) -> None:
-    """It crosses process borders with all scores and metrics."""
-    again = pickle.loads(pickle.dumps(persistence_card))
-    assert again.as_json() == persistence_card.as_json()
-    for name, score in persistence_card.submission.items():
-        assert again.submission[name].metric is score.metric
-        assert_array_equal(again.submission[name].per_frame, score.per_frame)
-
-
 def test_position_rmse_is_that_of_xarray(
     bench: ScoreBench, persistence_card: ScoreCard
 ) -> None:
@@ -129,15 +112,6 @@ def test_position_rmse_is_that_of_xarray(
     assert_allclose(rmse, expected, rtol=1e-6)
 
 
-def test_a_card_is_shown_in_one_line(persistence_card: ScoreCard) -> None:
-    """A notebook shows the method, the ranking metric and the skill."""
-    text = repr(persistence_card)
-    assert len(text) < 200
-    assert persistence_card.header.method in text
-    assert persistence_card.ranking in text
-    assert str(persistence_card.skill) in text
-
-
 def test_json_has_the_scores_of_the_card(persistence_card: ScoreCard) -> None:
     """Means and values per scenario have nine digits."""
     rows = load_json(persistence_card)["rows"]
@@ -151,27 +125,6 @@ def test_json_has_the_scores_of_the_card(persistence_card: ScoreCard) -> None:
             assert entry["values"] == values
             assert entry["undefined"] == list(score.undefined)
             assert ("at" in entry) == score.metric.per_frame
-
-
-def test_json_has_the_frames_of_interest_and_the_last(
-    persistence_card: ScoreCard,
-) -> None:
-    content = load_json(persistence_card)
-    config = persistence_card.config
-    last = config.predicted_frames[-1]
-    expected = {*config.frames_of_interest, last}
-    frames = content["task"]["frames"]
-    assert frames == sorted(expected)
-    mse = row_of_submission(content)["position_mse"]
-    assert list(mse["at"]) == [str(frame) for frame in frames]
-
-
-def test_json_describes_the_metrics(persistence_card: ScoreCard) -> None:
-    metric = load_json(persistence_card)["metrics"]["vorticity_rmse"]
-    assert metric["family"] == "vorticity"
-    assert metric["unit"] == "1/frame"
-    assert metric["direction"] == "lower"
-    assert metric["perfect"] == 0.0
 
 
 def test_undefined_values_are_null_in_json(persistence_card: ScoreCard) -> None:
@@ -267,14 +220,6 @@ def test_the_order_of_scenarios_does_not_change_the_bytes(
     assert_same_files(card, persistence_card)
 
 
-def test_json_has_no_paths(
-    bench: ScoreBench, persistence_card: ScoreCard, predictions: Path
-) -> None:
-    text = persistence_card.files[0].read_text()
-    assert str(bench.root) not in text
-    assert str(predictions.parent) not in text
-
-
 def test_a_wild_prediction_gets_finite_scores(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
@@ -294,24 +239,6 @@ def test_a_wild_prediction_gets_finite_scores(
     checks = {warning["check"] for warning in content["warnings"]}
     assert checks >= {"in_domain", "max_displacement"}
     assert content["flags"]["physics"]["raised"]
-
-
-def test_a_printed_warning_says_where(bench: ScoreBench, tmp_path: Path) -> None:
-    """Its line names scenario, frames and particle of a jump."""
-
-    def jumping(truth: Any, n: int, h: int) -> Any:
-        positions = np.array(straight(truth, n, h))
-        positions[3:, 7] += 9.0
-        return positions
-
-    path = bench.submit(tmp_path / "predictions.nc", jumping)
-    card = bench.evaluate(path)
-    printed = "\n".join(flag_lines(card))
-    places = re.findall(r"warning \[max_displacement\] .* \((.*)\): ", printed)
-    jumps = [each for each in card.warnings if each.check == "max_displacement"]
-    assert places == [jump.where for jump in jumps]
-    assert len(places) == 2
-    assert all("particle 7" in place for place in places)
 
 
 def test_a_validated_file_is_not_validated_again(
@@ -338,50 +265,6 @@ def test_a_validated_file_is_not_validated_again(
         bench.evaluate(other, validated=validated)
 
 
-def test_scoring_reads_every_predicted_frame_once(
-    bench: ScoreBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The validation, which is done before, reads the frames too."""
-    validated = validate(
-        predictions,
-        root=bench.root,
-        require_truth=True,
-        registry=bench.registry,
-    )
-    reads: Counter[tuple[int, int]] = Counter()
-    read_frames = Predictions.frames
-
-    def count_and_read(
-        self: Predictions, scenario: int, start: int, count: int
-    ) -> NDArray[np.float32]:
-        for frame in range(start, start + count):
-            reads[scenario, frame] += 1
-        return read_frames(self, scenario, start, count)
-
-    monkeypatch.setattr(Predictions, "frames", count_and_read)
-    bench.evaluate(predictions, validated=validated, workers=1)
-
-    task = bench.size.task
-    frames = range(task.input_frames, task.input_frames + task.horizon)
-    assert reads == Counter(product(bench.size.subsets["test"], frames))
-
-
-@pytest.mark.parametrize("workers", [0, -1])
-def test_no_worker_cannot_score(
-    workers: int, bench: ScoreBench, predictions: Path
-) -> None:
-    """Less than one is a mistake, also where one process does the work."""
-    with pytest.raises(UsageError) as caught:
-        bench.evaluate(predictions, workers=workers)
-    assert caught.value.where == "--workers"
-
-
-def test_progress_reaches_its_total(bench: ScoreBench, predictions: Path) -> None:
-    reports: list[Progress] = []
-    bench.evaluate(predictions, workers=1, progress=reports.append)
-    assert_every_frame_counted_once(reports, bench)
-
-
 @pytest.mark.usefixtures("as_shipped")
 def test_invalid_predictions_are_refused(
     bench: ScoreBench, predictions: Path, tmp_path: Path
@@ -393,7 +276,7 @@ def test_invalid_predictions_are_refused(
     results: list[Any] = []
     with pytest.raises(ChecksFailedError) as caught:
         bench.score(broken, examined=results.append)
-    assert caught.value.where == "first in scenario 3, frame 9, particle 5, y"
+    assert "scenario 3, frame 9, particle 5, y" in str(caught.value)
     (result,) = results
     checks = [finding.check for finding in result.errors]
     assert checks == ["finite"]
@@ -407,44 +290,7 @@ def test_a_root_without_the_data_set_is_an_error(
     assert validate(path, root=bench.root, registry=bench.registry).valid
     with pytest.raises(DataError) as caught:
         scoring.score(path, root=tmp_path / "root", registry=bench.registry)
-    assert str(caught.value.where).endswith("root/curl-noise/tiny/v2/test")
-
-
-def test_scenarios_without_statistics_of_train_are_not_enough(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
-    root = tmp_path / "root"
-    path = bench.submit(tmp_path / "predictions.nc", still)
-    for scenario in bench.size.subsets["test"]:
-        source = bench.task.truth.path(scenario)
-        target = root / source.relative_to(bench.root)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(source, target)
-    with pytest.raises(DataError):
-        scoring.score(path, root=root, registry=bench.registry)
-
-
-def test_a_misspelt_extra_is_refused(bench: ScoreBench, predictions: Path) -> None:
-    with pytest.raises(UsageError) as caught:
-        bench.evaluate(predictions, extras=("transprot",))
-    assert caught.value.where == "--extras"
-
-
-def test_an_extra_that_is_not_installed_is_refused_before_the_work(
-    bench: ScoreBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing is validated or measured first."""
-    monkeypatch.setitem(sys.modules, "ot", None)
-    seen: list[object] = []
-    with pytest.raises(UsageError) as caught:
-        bench.evaluate(
-            predictions,
-            extras=("transport",),
-            examined=seen.append,
-            progress=seen.append,
-        )
-    assert "lagbench[transport]" in str(caught.value.fix)
-    assert seen == []
+    assert "root/curl-noise/tiny/v2/test" in str(caught.value)
 
 
 @pytest.mark.slow
@@ -468,17 +314,6 @@ def test_a_card_becomes_a_table_of_values(bench: ScoreBench, tmp_path: Path) -> 
     expected = card.submission[card.ranking].mean
     assert lines.value.mean() == pytest.approx(expected)
     assert set(table.row) == set(card.scores)
-
-
-def test_a_card_in_a_notebook_is_escaped(bench: ScoreBench, tmp_path: Path) -> None:
-    """The name of the method comes from strangers."""
-    method = "<img src=x>"
-    path = bench.submit(tmp_path / "predictions.nc", half_right, method=method)
-    card = bench.evaluate(path)
-    page = card._repr_html_()
-    assert "&lt;img src=x&gt;" in page
-    assert "<img" not in page
-    assert card.ranking in page
 
 
 def test_predictions_for_another_split_are_refused(
@@ -538,13 +373,6 @@ def test_own_metrics_are_measured_without_a_package(
 
 
 @pytest.mark.slow
-def test_one_own_metric_needs_no_list(bench: ScoreBench, tmp_path: Path) -> None:
-    path = bench.submit(tmp_path / "predictions.nc", right)
-    card = bench.evaluate(path, metrics=FALL)
-    assert card.submission["fall"].mean == 0.0
-
-
-@pytest.mark.slow
 def test_an_own_metric_may_follow_from_others(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
@@ -565,10 +393,6 @@ def test_an_own_metric_may_follow_from_others(
     ("metrics", "options"),
     [
         (3, {}),
-        ([3], {}),
-        ([np], {}),
-        ([object()], {}),
-        ("vorticity_rmse", {}),
         (["vorticity_rmse"], {}),
         ([lambda pair: 0.0], {}),
         ([replace(FALL, name="position_rmse")], {}),
@@ -576,6 +400,7 @@ def test_an_own_metric_may_follow_from_others(
         ([replace(FALL, statistic=None, of=("nothing",))], {}),
         ([FALL], {"workers": 2}),
         ([FALL], {"scheduler": "tcp://localhost:1"}),
+        ((), {"extras": ("transprot",)}),
     ],
 )
 def test_what_is_no_own_metric_is_refused(
@@ -585,10 +410,8 @@ def test_what_is_no_own_metric_is_refused(
     options: dict[str, object],
 ) -> None:
     """Nothing is scored before."""
-    with pytest.raises(UsageError) as caught:
+    with pytest.raises(UsageError):
         bench.evaluate(tmp_path / "none.nc", metrics=metrics, **options)
-    error = caught.value
-    assert None not in (error.where, error.expected, error.got, error.fix)
 
 
 def test_an_own_metric_that_fails_leaves_no_file_open(
@@ -606,36 +429,6 @@ def test_an_own_metric_that_fails_leaves_no_file_open(
     after = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE)
     assert after == before
     assert caught.value.__cause__ is not None
-
-
-@pytest.mark.parametrize("metrics", ["vorticity_rmse", ["vorticity_rmse"]])
-def test_a_built_in_metric_needs_no_argument(
-    bench: ScoreBench, tmp_path: Path, metrics: object
-) -> None:
-    with pytest.raises(UsageError) as caught:
-        bench.evaluate(tmp_path / "none.nc", metrics=metrics)
-    assert "metrics=" in str(caught.value.fix)
-
-
-@pytest.mark.slow
-def test_the_own_metric_of_the_docs_is_measured(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
-    """The example of docs/extending.md runs as it stands; its scorer is the bench."""
-    page = Path(__file__).parents[2] / "docs" / "extending.md"
-    found = re.search(
-        r"```python\n(import numpy as np\n\nimport lagbench\n.*?)```",
-        page.read_text(),
-        re.DOTALL,
-    )
-    assert found is not None
-    program, call = found[1].split("\ncard = ")
-    names: dict[str, Any] = {}
-    exec(program, names)
-    assert "metrics=[mean_height_error]" in call
-    path = bench.submit(tmp_path / "predictions.nc", right)
-    card = bench.evaluate(path, metrics=[names["mean_height_error"]])
-    assert card.submission["mean_height_error"].mean == 0.0
 
 
 def test_scores_stay_out_of_the_folder_of_a_split(tmp_path: Path) -> None:
@@ -664,7 +457,7 @@ def test_scores_of_another_submission_are_not_overwritten(
     key: str,
     value: str,
 ) -> None:
-    """Another method, data set or subset; the message tells them apart."""
+    """Another method, data set or subset."""
     content = load_json(persistence_card) | {key: value}
     path = tmp_path / "scores.json"
     path.write_text(json.dumps(content))
@@ -672,6 +465,4 @@ def test_scores_of_another_submission_are_not_overwritten(
     with pytest.raises(UsageError) as caught:
         bench.score(predictions, output_dir=tmp_path)
     assert caught.value.where == str(path)
-    assert value in str(caught.value.got)
-    assert value not in str(caught.value.expected)
     assert path.read_bytes() == before

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
-from numpy.testing import assert_allclose, assert_array_equal
-from score_bench import ScoreBench, right, still, straight
+from numpy.testing import assert_allclose
+from score_bench import ScoreBench, still, straight
 
 from lagbench.data.registry import Measured, Registry, Size, load
 from lagbench.errors import DataError, UsageError
@@ -25,26 +24,22 @@ from lagbench.references.shipped import (
     write_shipped,
 )
 from lagbench.references.shipped import solver_seconds as solver_seconds_of
-from lagbench.references.table import NAIVE
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.front import NoSpeedup, Speedup
 from lagbench.scoring.measure_references import measure_and_ship
 from lagbench.scoring.references import (
-    differences,
     measurable,
     measure,
-    saved_folder,
     sizes_with_test_files,
 )
-from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import speedup_beside
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import (
-    best_reference,
     compute_skill,
 )
 from lagbench.scoring.tables import card_tables
+from lagbench.scoring.task import SUBMISSION
 from lagbench.submission import Header
 
 
@@ -83,19 +78,6 @@ def test_skill_is_one_minus_the_ratio_of_means(
     assert result.value == skill
 
 
-def test_skill_is_measured_against_references_without_equations() -> None:
-    """The coarse solver knows the equations, and unknown references do not count."""
-    references = {
-        "analog": scored([2.0]),
-        "coarse-solver": scored([0.1]),
-        "unknown": scored([0.1]),
-    }
-    counting = {}
-    for name in NAIVE.intersection(references):
-        counting[name] = references[name]
-    assert best_reference(counting) == "analog"
-
-
 def test_scenarios_that_one_side_lacks_are_left_out() -> None:
     references = {"analog": scored([4.0, math.nan])}
     method = scored([1.0, 9.0])
@@ -116,16 +98,6 @@ def test_scenarios_that_one_side_lacks_are_left_out() -> None:
 def test_some_references_give_no_skill(reference: Score) -> None:
     method = scored([1.0, 1.0])
     assert compute_skill([method], {"analog": reference}) is None
-
-
-def test_without_a_reference_there_is_no_skill() -> None:
-    method = scored([1.0, 1.0])
-    assert compute_skill([method], {}) is None
-
-
-def test_a_metric_of_which_more_is_better_gives_no_skill() -> None:
-    pearson = scored([0.5, 0.5], "vorticity_pearson")
-    assert compute_skill([pearson], {"analog": pearson}) is None
 
 
 @pytest.mark.parametrize("solver_seconds", [1.0, None])
@@ -170,13 +142,6 @@ def test_a_ratio_that_is_the_same_in_every_scenario_is_certain() -> None:
     result = compute_skill([half], {"analog": reference})
     assert result.value == 0.5
     assert result.interval == (0.5, 0.5)
-
-
-def test_three_scenarios_have_no_interval() -> None:
-    reference = scored([1.0, 2.0, 5.0])
-    method = scored([1.0, 1.0, 4.0])
-    result = compute_skill([method], {"analog": reference})
-    assert np.isnan(result.interval).all()
 
 
 def test_the_interval_is_that_of_resampled_ratios() -> None:
@@ -318,11 +283,11 @@ def test_shipped_scores_are_the_measured_ones(
     )
     assert path == shipped_path(size, tmp_path)
     from_file = shipped(size, tmp_path)
-    assert differences(from_file, measured_references) == {}
     for name, reference in measured_references.items():
         for metric, expected in reference.scores.items():
             score = from_file[name].scores[metric]
             assert score.undefined == expected.undefined
+            assert_allclose(score.values, expected.values, rtol=1e-4, atol=1e-12)
             if expected.metric.per_frame:
                 mean = mean_at(score, 25)
                 expected_mean = mean_at(expected, 25)
@@ -392,22 +357,6 @@ def test_one_reference_measured_anew_leaves_the_others(
         )
 
 
-def test_a_full_measurement_replaces_all_references(
-    bench: ScoreBench, measured_references: References, tmp_path: Path
-) -> None:
-    size = record(bench.size)
-    options: dict[str, Any] = {
-        "dataset_sha256": SHA256,
-        "reported": (15,),
-        "folder": tmp_path,
-    }
-    path = write_shipped(size, measured_references, **options)
-    analog = measured_references["analog"]
-    write_shipped(size, {"analog": analog}, **options)
-    content = json.loads(path.read_text())
-    assert list(content["floors"]) == ["analog"]
-
-
 def test_a_reference_that_a_data_set_lacks_is_not_measured(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
@@ -422,63 +371,6 @@ def test_a_reference_that_a_data_set_lacks_is_not_measured(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_forged_shipped_score_is_found(
-    bench: ScoreBench, measured_references: References, tmp_path: Path
-) -> None:
-    """A value changed by 1 % differs, and so does a reference that is left out."""
-    references = {
-        "persistence": measured_references["persistence"],
-        "constant-velocity": measured_references["constant-velocity"],
-    }
-    size = record(bench.size)
-    path = write_shipped(
-        size,
-        references,
-        dataset_sha256=SHA256,
-        reported=(15,),
-        folder=tmp_path,
-    )
-    content = json.loads(path.read_text())
-    floors = content["floors"]
-    persistence_values = floors["persistence"]["values"]
-    persistence_values["position_rmse"][1] *= 1.01
-    del floors["constant-velocity"]
-    path.write_text(json.dumps(content))
-
-    changed_metrics = differences(shipped(size, tmp_path), references)
-    assert changed_metrics["persistence"] == ("position_rmse",)
-    all_metrics = set(references["constant-velocity"].scores)
-    assert set(changed_metrics["constant-velocity"]) == all_metrics
-
-
-FAILING = """
-from lagbench.metrics import Direction, Metric
-
-def fail(pair):
-    raise ValueError("mine")
-
-METRICS = Metric(
-    name="reference_fails", family="mine", unit="1", direction=Direction.LOWER,
-    perfect=0.0, source="here", summary="fails", statistic=fail,
-)
-"""
-
-
-def test_shipped_scores_have_no_metrics_of_packages(
-    bench: ScoreBench, package: Callable[..., Path]
-) -> None:
-    """So a metric of a package makes no difference to a new measurement."""
-    package("metrics", "reference_metric:METRICS", FAILING)
-    measured = measure(bench.size, bench.root, names=["persistence"])
-    assert set(measured["persistence"].scores).issubset(METRICS)
-
-
-def test_sizes_that_lie_in_a_root_can_be_measured(bench: ScoreBench) -> None:
-    sizes = sizes_with_test_files(bench.root, registry=bench.registry)
-    names = [size.name for size in sizes]
-    assert names == [bench.size.name]
-
-
 def test_a_size_that_only_some_splits_have_can_be_measured(bench: ScoreBench) -> None:
     """A split of another package need not have all sizes of ours."""
     split = bench.registry.split(bench.size.split)
@@ -491,37 +383,6 @@ def test_a_size_that_only_some_splits_have_can_be_measured(bench: ScoreBench) ->
     assert sizes_with_test_files(bench.root, name="other", registry=registry) == []
     with pytest.raises(UsageError):
         sizes_with_test_files(bench.root, name="none", registry=registry)
-
-
-def test_an_interrupted_measurement_goes_on(
-    bench: ScoreBench, copied: Callable[[], Path]
-) -> None:
-    """It takes stored statistics as they are: an altered file shows in its result."""
-    size = record(bench.size)
-    root = copied()
-
-    def measure_persistence(**options: Any) -> Any:
-        references = measure(size, root, names=["persistence"], **options)
-        persistence = references["persistence"]
-        return persistence.scores["position_mse"].values
-
-    first = measure_persistence(resume=True)
-    files = sorted(saved_folder(size, root).glob("*.npz"))
-    assert len(files) == len(size.subsets["test"])
-    with np.load(files[0]) as stored:
-        arrays = dict(stored)
-    arrays["total"] = 4.0 * arrays["total"]
-    np.savez(files[0], **arrays)
-
-    resumed = measure_persistence(resume=True)
-    assert_allclose(resumed[0], 4.0 * first[0])
-    fresh = measure_persistence()
-    assert_array_equal(fresh, first)
-    names = ["constant-velocity", "persistence"]
-    both = measure(size, root, names=names, resume=True)
-    assert set(both) == set(names)
-    remeasured = both["persistence"].scores["position_mse"].values
-    assert_array_equal(remeasured[0], first[0])
 
 
 def test_scoring_takes_what_is_shipped(
@@ -545,12 +406,6 @@ def test_scoring_takes_what_is_shipped(
     assert card.as_json() == measured.as_json()
 
 
-def test_the_truth_has_skill_1(bench: ScoreBench, tmp_path: Path) -> None:
-    path = bench.submit(tmp_path / "predictions.nc", right)
-    card = bench.evaluate(path)
-    assert card.skill.value == 1.0
-
-
 def test_persistence_has_no_skill(bench: ScoreBench, tmp_path: Path) -> None:
     """Card, JSON, scores.nc and the first row of the table agree on it."""
     path = bench.submit(tmp_path / "predictions.nc", still)
@@ -562,8 +417,6 @@ def test_persistence_has_no_skill(bench: ScoreBench, tmp_path: Path) -> None:
     as_json = card.as_json()["skill"]
     assert as_json["floor"] == skill.reference
     assert as_json["value"] == pytest.approx(skill.value)
-    stored = read_statistics(card.files[1]).skill()
-    assert stored.reference == skill.reference
-    assert stored.value == skill.value
+    assert read_statistics(card.files[1]).best_reference == skill.reference
     first_table = next(iter(card_tables(card)))
     assert first_table.rows[0][0].startswith("skill")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from fault_registry import positions, rows, store
-from faults import FAULTS
+from faults import positions, rows, store
 from numpy.typing import ArrayLike
 from scenario_factory import make_key, write_scenario
 from submission_data import (
@@ -44,10 +41,9 @@ from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
 from lagbench.scoring.score import score
 from lagbench.submission import Severity, ValidationResult, template, validate
-from lagbench.submission.checks import ScenarioScan, check_domain
 from lagbench.submission.issues import IssueCollector
-from lagbench.submission.task_checks import format_numbers
 from lagbench.submission.truth import Truth
+from lagbench.submission.validation import ScenarioScan, check_domain
 
 bench = small
 
@@ -60,14 +56,6 @@ def changed(bench: Bench, new: ArrayLike, place: Any = ...) -> ValidationResult:
         values[place] = new
         store(file, values)
     return bench.validate(path)
-
-
-def test_an_error_keeps_the_zero_that_it_got(bench: Bench) -> None:
-    """A diameter of 0 is a value, not a missing one."""
-    issues = IssueCollector()
-    issues.add_exception("dataset", DataError("no size", expected=1, got=0.0))
-    (issue,) = issues.result(bench.valid).errors
-    assert (issue.expected, issue.got) == ("1", "0.0")
 
 
 @pytest.mark.parametrize(("periods", "is_flagged"), [(0.9, False), (-4.0, True)])
@@ -99,10 +87,8 @@ def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
     flag = next(f for f in result.findings if f.check == "in_domain")
     assert flag.severity == Severity.WARNING
     assert result.exit_code == 0
-    assert flag.where == "first in scenario 4, frame 7, particle 9"
-    # 1 / (3 * 8 * 48) = 0.087 %
-    assert "0.09%" in flag.what
-    assert "0.562" in flag.got
+    assert flag.where.endswith("scenario 4, frame 7, particle 9")
+    assert flag.share == pytest.approx(1 / (3 * 8 * 48), rel=1e-3)
     for place, flagged in ((1.06, False), (1.07, True)):
         assert (
             "in_domain" in {f.check for f in changed(bench, place).warnings}
@@ -142,7 +128,7 @@ def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
     """
     source = truth_of(bench)
     limit = 10 * source.largest_displacement(3, enough=np.inf)
-    flagged: list[list[float]] = []
+    flagged = []
     steps = np.diff(
         np.concatenate([source.given_frames(3), truth(3)]).astype("f8"), axis=0
     )
@@ -154,10 +140,9 @@ def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
             0,
         )
         assert result.exit_code == 0
-        flagged.append(
-            [float(f.got) for f in result.warnings if f.check == "discontinuous_start"]
-        )
-    assert flagged == [[], [pytest.approx(1.1 * limit, rel=0.01)]]
+        flagged.append(result.warnings)
+    assert not flagged[0]
+    assert flagged[1][0].check == "discontinuous_start"
 
 
 def test_all_issues_are_reported_together(bench: Bench) -> None:
@@ -197,12 +182,11 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
         "shifted",
         "max_displacement",
     }
-    assert "lagbench generate --split cavity" in result.skipped["start"]
     required = elsewhere.validate(bench.valid, require_truth=True)
     assert required.exit_code == 4
     with pytest.raises(DataError) as caught:
         required.check()
-    assert caught.value.where.endswith("cavity/tiny/v2/test")
+    assert "cavity/tiny/v2/test" in str(caught.value)
     result = validate(
         bench.valid,
         root=tmp_path,
@@ -210,33 +194,6 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
     )
     flag = next(f for f in result.findings if f.check == "dataset")
     assert flag.severity == Severity.WARNING
-    assert "datasets.yaml" in flag.got
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        (
-            "truncated_half",
-            UnreadableFileError,
-        ),
-        (
-            "stale_hash",
-            DataError,
-        ),
-        (
-            "one_nan",
-            ChecksFailedError,
-        ),
-    ],
-)
-def test_check_raises_the_error_of_the_exit_code(
-    bench: Bench, name: str, kind: type[Exception]
-) -> None:
-    """3, 4 and 1; a valid file raises nothing."""
-    with pytest.raises(kind, match=FAULTS[name].check):
-        bench.validate(FAULTS[name].make(bench)).check()
-    bench.validate(bench.valid).check()
 
 
 @pytest.mark.parametrize(
@@ -252,42 +209,19 @@ def test_the_raised_error_describes_the_check_that_decides_its_class(
 ) -> None:
     issues = IssueCollector()
     for check in checks:
-        issues.error(check, "wrong", where=check, expected="", got="", fix="mend it")
+        issues.error(check, "wrong; mend it", where="/")
     result = issues.result(Path("p.nc"))
     with pytest.raises(kind) as caught:
         result.check()
-    assert caught.value.where == deciding_check
+    assert f"[{deciding_check}]" in str(caught.value)
     assert result.exit_code == caught.value.exit_code
 
 
-def test_issues_read_as_what_where_expected_got_fix(bench: Bench) -> None:
-    """Each part has a line of its own, after severity and name of the check."""
-    path = rows(bench, "text", [3, 4, 5], [3, 5, 7, 9], np.s_[:, ::2])
-    issue = bench.validate(path).errors[0]
-    assert str(issue).splitlines() == [
-        f"error [frames] {issue.what}",
-        f"  where: {issue.where}",
-        f"  expected: {issue.expected}",
-        f"  got: {issue.got}",
-        f"  fix: {issue.fix}",
-    ]
-    assert "3-10" in issue.expected
-    assert "3,5,7,9" in issue.got
-
-
-def test_a_line_break_in_a_name_begins_no_part_of_a_message(tmp_path: Path) -> None:
-    """A stranger could name a file so that the message holds a fix of the stranger."""
-    path = tmp_path / "no\n  fix: run this\x1b[2J.nc"
-    result = validate(path)
-    for text in (str(result), str(result.errors[0])):
-        lines = text.splitlines()
-        fixes = [line for line in lines if line.startswith("  fix:")]
-        assert len(fixes) == 1
-        assert "run this" not in fixes[0]
-        assert "\x1b" not in text
-    with pytest.raises(UnreadableFileError) as caught:
-        result.check()
-    assert str(caught.value).count("\n  fix:") == 1
+def test_a_name_of_a_file_breaks_no_line(tmp_path: Path) -> None:
+    """A stranger could name a file so that the message commands the terminal."""
+    result = validate(tmp_path / "no\n  run this\x1b[2J.nc")
+    assert len(str(result).splitlines()) == 3
+    assert "\x1b" not in str(result)
 
 
 @pytest.fixture
@@ -319,18 +253,6 @@ def hashed() -> Iterator[mock.Mock]:
         yield listening
 
 
-@pytest.mark.parametrize("first", [0, 10**9])
-def test_a_list_of_numbers_that_is_cut_says_how_many_there_are(first: int) -> None:
-    """A negative number among them, as a damaged file may have, changes nothing."""
-    numbers = range(first, first + 100, 2)
-    for negative in ([], [-7]):
-        listing = [*numbers, *negative]
-        text = format_numbers(listing)
-        assert f"({len(listing)} numbers)" in text
-        assert len(text) < 120
-    assert "numbers" not in format_numbers([3, 5, -7])
-
-
 @pytest.mark.parametrize(
     "damage", ["cut", "another scenario", "one value, all attributes kept"]
 )
@@ -358,7 +280,7 @@ def test_a_damaged_data_set_is_not_blamed_on_the_submission(
     assert result.verdict == "not judged"
     assert str(path) in result.errors[0].where
     command = "lagbench generate --split cavity --size tiny --subset test --root"
-    assert f"{command} {shlex.quote(str(own.root))}" in result.errors[0].fix
+    assert f"{command} {shlex.quote(str(own.root))}" in result.errors[0].what
     assert set(result.skipped) == {
         "start",
         "discontinuous_start",
@@ -379,35 +301,6 @@ def test_a_change_after_the_check_is_refused(own: Bench, hashed: mock.Mock) -> N
         truth_of(own).check()
     assert caught.value.exit_code == 4
     assert hashed.mock_calls == [mock.call(path)]
-
-
-def test_other_notes_count_for_nothing(
-    own: Bench, tmp_path: Path, hashed: mock.Mock
-) -> None:
-    """Values are hashed once; where a folder is copied with its notes its files are
-    hashed again.
-
-    So they are where the notes are damaged, which are written anew.
-    """
-    truth_of(own).check()
-    truth_of(own).check()
-    assert hashed.call_count == 3
-    root = tmp_path / "copy"
-    shutil.copytree(own.root, root)
-    Truth(own.registry.size("cavity", "tiny"), root).check()
-    assert hashed.call_count == 6
-    notes = truth_of(own).folder / NOTES_NAME
-    for text in (
-        "",
-        "[]",
-        "{",
-        '{"test/0004.nc": 1}',
-        '{"test/0004.nc": [1]}',
-        "[" * 10**5,
-    ):
-        notes.write_text(text)
-        truth_of(own).check()
-        assert set(json.loads(notes.read_text())) == {f"test/{i:04d}.nc" for i in TESTS}
 
 
 def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:

@@ -1,6 +1,6 @@
 """How predictions begin: permuted truth is refused, bad models are scored.
 
-The tests run on the tiny data of all four splits.
+The tests run on tiny data of a full box and of a free surface.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class World:
         return validate(path, root=self.root)
 
 
-SPLITS = ["cavity", "curl-noise", "fluid", "multimaterial"]
+SPLITS = ["curl-noise", "multimaterial"]
 
 
 @pytest.fixture(scope="module", params=SPLITS)
@@ -103,27 +103,6 @@ def permuted(world: World, scenario: int) -> Floats:
     return truth[:, order]
 
 
-def permuted_within_materials(world: World, scenario: int) -> Floats:
-    """The truth, the particles of each material in another order."""
-    material = world.material[scenario]
-    order = np.arange(world.size.particles)
-    for kind in np.unique(material):
-        particles = np.flatnonzero(material == kind)
-        order[particles] = rng(scenario).permutation(particles)
-    truth = world.truth(scenario)
-    return truth[:, order]
-
-
-def a_third_permuted(world: World, scenario: int) -> Floats:
-    """The truth, a third of the particles in another order."""
-    order = np.arange(world.size.particles)
-    count = len(order) // 3
-    particles = rng(scenario).choice(order, count, replace=False)
-    order[np.sort(particles)] = particles
-    truth = world.truth(scenario)
-    return truth[:, order]
-
-
 def under_the_next_number(world: World, scenario: int) -> Floats:
     """The truth, every particle stored as the next one."""
     truth = world.truth(scenario)
@@ -150,8 +129,6 @@ def permuted_and_at_rest(world: World, scenario: int) -> Floats:
     "predict",
     [
         permuted,
-        permuted_within_materials,
-        a_third_permuted,
         under_the_next_number,
         two_particles_exchanged,
         permuted_and_at_rest,
@@ -170,12 +147,6 @@ def test_permuted_truth_is_refused(
 # --- scored, however bad ----------------------------------------------------------
 
 
-def mean_over_scenarios(world: World, _: int) -> Floats:
-    """The same for every scenario."""
-    truths = [world.truth(scenario) for scenario in world.positions]
-    return np.mean(truths, axis=0)
-
-
 def noise(world: World, scenario: int) -> Floats:
     """Normal numbers for every position."""
     shape = world.truth(scenario).shape
@@ -192,19 +163,6 @@ def noisy(amplitude: float) -> Predict:
     return predict
 
 
-def turned(world: World, scenario: int) -> Floats:
-    """Turned and shrunk, with noise: what a network trained too little does."""
-    matrix = np.array([[0.9, 0.1], [-0.1, 0.8]])
-    distorted = world.truth(scenario) @ matrix
-    return distorted + 0.05 + 0.03 * noise(world, scenario)
-
-
-def twice_as_far(world: World, scenario: int) -> Floats:
-    """Particles go twice as far from the last given frame as they should."""
-    truth = world.truth(scenario)
-    return 2 * truth - world.last(scenario)
-
-
 def partly_lost(world: World, scenario: int) -> Floats:
     """A third of the particles anywhere within a twentieth of the box."""
     position = world.truth(scenario).copy()
@@ -214,17 +172,6 @@ def partly_lost(world: World, scenario: int) -> Floats:
     error = rng(scenario).uniform(-0.05, 0.05, lost.shape)
     position[:, is_lost] = lost + error
     return position
-
-
-def shifted_right(world: World, scenario: int) -> Floats:
-    """A tenth of the box off."""
-    return world.truth(scenario) + np.array([0.1, 0.0])
-
-
-def anywhere(world: World, scenario: int) -> Floats:
-    """Random places in the unit box."""
-    shape = world.truth(scenario).shape
-    return rng(scenario).random(shape)
 
 
 def in_one_point(world: World, scenario: int) -> Floats:
@@ -252,14 +199,6 @@ def displacements(world: World, scenario: int) -> Floats:
     return np.diff(frames, axis=0)
 
 
-def standardised(world: World, scenario: int) -> Floats:
-    """Mean 0 and deviation 1."""
-    truth = world.truth(scenario)
-    mean = truth.mean((0, 1))
-    std = truth.std((0, 1))
-    return (truth - mean) / std
-
-
 def another_scenario(world: World, scenario: int) -> Floats:
     """The truth of the next scenario."""
     scenarios = list(world.positions)
@@ -270,34 +209,27 @@ def another_scenario(world: World, scenario: int) -> Floats:
 @pytest.mark.parametrize(
     "predict",
     [
-        mean_over_scenarios,
         noisy(0.01),
         noisy(0.5),
-        turned,
-        twice_as_far,
         partly_lost,
-        shifted_right,
-        anywhere,
         in_one_point,
         y_first,
         one_frame_late,
         displacements,
-        standardised,
         another_scenario,
     ],
 )
 def test_a_bad_model_is_scored_and_its_jump_flagged(
     world: World, tmp_path: Path, predict: Predict
 ) -> None:
-    """Nothing rejects it; a jump at the start is a warning with its size."""
+    """Nothing rejects it; a jump at the start is a warning."""
     result = world.validate(tmp_path / "p.nc", predict)
     assert result.valid
-    flagged = {}
+    flagged = set()
     for issue in result.warnings:
         if issue.check == "discontinuous_start":
             _, number, *_ = issue.where.split()
-            scenario = int(number.rstrip(","))
-            flagged[scenario] = float(issue.got)
+            flagged.add(int(number.rstrip(",")))
     given_and_predicted = world.input_frames + world.horizon
     for scenario, position in world.positions.items():
         first = predict(world, scenario)[0].astype("f4")
@@ -306,10 +238,7 @@ def test_a_bad_model_is_scored_and_its_jump_flagged(
         steps = np.diff(frames, axis=0).astype("f8")
         square_lengths = np.sum(steps**2, axis=-1)
         limit = 10 * np.sqrt(square_lengths.max())
-        is_flagged = scenario in flagged
-        assert is_flagged == (jump > limit)
-        if is_flagged:
-            assert flagged[scenario] == pytest.approx(jump, rel=0.01)
+        assert (scenario in flagged) == (jump > limit)
 
 
 def root_mean_square(vectors: Floats) -> float:

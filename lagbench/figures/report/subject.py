@@ -22,8 +22,7 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
 from lagbench.scoring.card import ScoreCard, number_methods
-from lagbench.scoring.scenario import SUBMISSION
-from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
+from lagbench.scoring.task import SUBMISSION, OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import Predictions, open_predictions
 
 Floats = NDArray[np.float64]
