@@ -152,8 +152,9 @@ def read_published_scores(path: Path) -> PublishedScores:
     rows = {SUBMISSION: submission}
     ranking = statistics.ranking
     if statistics.best_reference is not None and ranking in submission:
-        values = statistics.best_reference_values
-        reference = replace(submission[ranking], values=values)
+        reference = replace(
+            submission[ranking], values=statistics.best_reference_values
+        )
         rows[statistics.best_reference] = {ranking: reference}
     return PublishedScores(
         identity=statistics.identity,

@@ -163,7 +163,7 @@ class Attributes(Labels):
 class Header(Attributes):
     """What a predictions.nc says about itself."""
 
-    lagbench_format: Literal[1] = FORMAT
+    lagbench_format: Literal[1] = 1
     scenarios: tuple[int, ...]  # ids in the order in which they are stored
     frames: tuple[int, ...]  # absolute numbers of the predicted frames
     particles: int  # particles in every frame; the most of any scenario
