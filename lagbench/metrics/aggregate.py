@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data.layout import format_ids
-from lagbench.errors import UnknownKeyError, UsageError, suggest_name
+from lagbench.errors import UsageError
 
 from .frame import Floats, FramePair
 from .metric import Metric, identity, mean, mean_of_rows, root_mean_square
@@ -117,16 +117,9 @@ class Tally:
         return values
 
     @cached_property
-    def _is_measured(self) -> NDArray[np.bool_]:
-        """Whether a value was measured, defined or not, shape [statistic, frame]."""
-        is_measured = self.weight + self.undefined > 0
-        is_measured.flags.writeable = False
-        return is_measured
-
-    @cached_property
-    def _row_numbers(self) -> Mapping[str, int]:
-        """Row of each statistic in the arrays."""
-        return {name: row for row, name in enumerate(self.names)}
+    def is_measured(self) -> NDArray[np.bool_]:
+        """Whether a value was measured, defined or not, [statistic, frame]."""
+        return np.asarray(self.weight + self.undefined > 0)
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields; another process forms the cached arrays again."""
@@ -134,15 +127,15 @@ class Tally:
 
     def series(self, name: str) -> Floats:
         """Return a statistic per frame, NaN without a value, [frame], read-only."""
-        series: Floats = self.values[self._row_numbers[name]]
+        series: Floats = self.values[self.names.index(name)]
         return series
 
     def measured(self, name: str) -> NDArray[np.bool_]:
         """Return at which frames a statistic was measured, defined or not.
 
-        The shape is [frame], read-only.
+        The shape is [frame].
         """
-        is_measured: NDArray[np.bool_] = self._is_measured[self._row_numbers[name]]
+        is_measured: NDArray[np.bool_] = self.is_measured[self.names.index(name)]
         return is_measured
 
 
@@ -182,13 +175,8 @@ def tally(
     pairs: Iterable[FramePair], metrics: Sequence[Metric], frames: Sequence[int]
 ) -> Tally:
     """Measure consecutive frame pairs, one in memory at a time."""
-    names = []
-    for metric in metrics:
-        if metric.statistic is not None:
-            names.append(metric.name)
-    values = {}
-    for pair in pairs:
-        values[pair.frame] = measure(pair, metrics)
+    names = [metric.name for metric in metrics if metric.statistic is not None]
+    values = {pair.frame: measure(pair, metrics) for pair in pairs}
     return Tally.of(names, frames, values)
 
 
@@ -239,11 +227,10 @@ class Resampling:
     @cached_property
     def _variances(self) -> list[float]:
         """Variance of the mean by part: ``sum(x^2) / (n (n - 1))``."""
-        variances = []
-        for part in self.parts.values():
-            count = len(part)
-            variances.append(float(np.sum(part**2)) / (count * (count - 1)))
-        return variances
+        return [
+            float(np.sum(part**2)) / (len(part) * (len(part) - 1))
+            for part in self.parts.values()
+        ]
 
     @property
     def error(self) -> float:
@@ -253,14 +240,8 @@ class Resampling:
     @property
     def freedom(self) -> float:
         """Degrees of freedom behind the error, after Satterthwaite."""
-        variances = self._variances
-        terms = []
-        for variance, part in zip(variances, self.parts.values(), strict=True):
-            terms.append(variance**2 / (len(part) - 1))
-        squares = math.fsum(terms)
-        if squares:
-            return math.fsum(variances) ** 2 / squares
-        return math.inf
+        counts = [len(part) for part in self.parts.values()]
+        return satterthwaite(self._variances, counts)
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -277,31 +258,17 @@ class Resampling:
         lower = (1.0 - LEVEL) / 2.0
         normal = NormalDist().inv_cdf(upper)
         stretch = student_quantile(self.freedom, upper) / normal
-        low, high = quantiles(self.deviations, (lower, upper))
+        low, high = np.quantile(self.deviations, (lower, upper)).tolist()
         return (self.mean + stretch * low, self.mean + stretch * high)
 
 
-def quantiles(values: Floats, shares: Sequence[float]) -> list[float]:
-    """Return quantiles of at least two values, linear between two of them.
-
-    Their bits are those of ``np.quantile``, which takes several times as long on the
-    few thousand draws of a bootstrap. So does a sort: only the values beside each
-    quantile have to be in their places.
-    """
-    places = [share * (len(values) - 1) for share in shares]
-    below = [min(int(place), len(values) - 2) for place in places]
-    above = [number + 1 for number in below]
-    partly_ordered = np.partition(values, below + above)
-    results = []
-    for place, number in zip(places, below, strict=True):
-        part = place - number
-        low, high = partly_ordered[number : number + 2].tolist()
-        gap = high - low
-        if part < 0.5:
-            results.append(float(low + gap * part))
-        else:
-            results.append(float(high - gap * (1.0 - part)))
-    return results
+def satterthwaite(variances: Sequence[float], counts: Sequence[int]) -> float:
+    """Return the degrees of freedom of a sum of variances of means."""
+    squares = math.fsum(
+        variance**2 / (count - 1)
+        for variance, count in zip(variances, counts, strict=False)
+    )
+    return math.fsum(variances) ** 2 / squares if squares else math.inf
 
 
 @functools.cache
@@ -332,27 +299,16 @@ def as_method(values: ArrayLike) -> Floats:
         values: numbers, NaN where undefined, shape [scenario] or [seed, scenario].
 
     Raises:
-        UsageError: the values are no numbers, or have another shape.
+        UsageError: the values are no finite numbers, or have another shape.
     """
-    expected = "numbers of shape [scenario] or [seed, scenario], NaN where undefined"
-    fix = "give one number for each seed and scenario"
     try:
         method = np.asarray(values, np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
+        raise UsageError(f"no array of numbers: {values!r:.60}") from error
+    if method.ndim > 2 or np.isinf(method).any():
         raise UsageError(
-            "the values of a method are no array of numbers",
-            where="values of a method",
-            expected=expected,
-            got=f"{type(values).__name__}: {values!r:.60}",
-            fix=fix,
-        ) from error
-    if method.ndim > 2:
-        raise UsageError(
-            "the values of a method have too many axes",
-            where="values of a method",
-            expected=expected,
-            got=f"shape {method.shape}",
-            fix=fix,
+            f"infinite values, or shape {method.shape}; give finite numbers, NaN where "
+            "undefined, of shape [scenario] or [seed, scenario]"
         )
     return np.atleast_2d(method)
 
@@ -388,11 +344,10 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
     methods = [as_method(values)]
     if minus is not None:
         methods.append(as_method(minus))
-    _check_values(methods)
-
-    has_value = []
-    for method in methods:
-        has_value.append(~np.isnan(method).all(axis=0))
+    counts = {method.shape[1] for method in methods}
+    if len(counts) > 1:
+        raise UsageError(f"methods over different scenarios: {sorted(counts)}")
+    has_value = [~np.isnan(method).all(axis=0) for method in methods]
     defined = np.all(has_value, axis=0)  # shape [scenario]
     if np.count_nonzero(defined) < 2:
         return None
@@ -411,21 +366,6 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
         if len(part) > 1:
             parts[stream] = part - np.mean(part)
     return Resampling(mean=float(np.mean(over_seeds)), parts=parts)
-
-
-def _check_values(methods: Sequence[Floats]) -> None:
-    """Refuse methods of shape [seed, scenario] that cannot be compared."""
-    counts = [method.shape[1] for method in methods]
-    if len(set(counts)) > 1:
-        raise UsageError(
-            "methods over different scenarios", expected=counts[0], got=counts[1]
-        )
-    if any(np.isinf(method).any() for method in methods):
-        raise UsageError(
-            "values are infinite",
-            expected="numbers, NaN where undefined",
-            got="infinity",
-        )
 
 
 def bootstrap_interval(
@@ -518,29 +458,15 @@ class Score:
         """
         name = self.metric.name
         if not self.metric.per_frame:
-            fix = "take .values, the numbers of whole rollouts"
-            others = [other for other in self.metric.of if other != name]
-            if others:
-                names = " or ".join(others)
-                fix += f"; or use {names}, which has values in single frames"
             raise UsageError(
-                "the metric has no value in single frames",
-                where=f"{name}, frame {ascii(frame)[:40]}",
-                expected="a metric with a value in each frame",
-                got=f"{name}, a number of a whole rollout",
-                fix=fix,
+                f"{name} has no value in single frames; take .values, of whole rollouts"
             )
-        try:
-            column = self.frames.index(frame)
-        except ValueError:
+        if frame not in self.frames:
             raise UsageError(
-                "the frame is not predicted",
-                where=f"{name}, frame",
-                expected=f"the absolute number of a predicted frame: "
-                f"{format_ids(self.frames)}",
-                got=ascii(frame)[:40],
-                fix=f"choose one of these, such as the last one: {self.frames[-1]}",
-            ) from None
+                f"frame {frame!r:.40} of {name} is not predicted; choose one of "
+                f"{format_ids(self.frames)}"
+            )
+        column = self.frames.index(frame)
         return self.per_frame[:, column]
 
     def interval_at(self, frame: int) -> tuple[float, float]:
@@ -552,99 +478,12 @@ class Score:
         return interval_in_range(self.at(frame), self.metric.value_range)
 
 
-class ScoresByMetric(dict[str, Score]):
-    """Scores by the name of their metric.
-
-    Raises:
-        UnknownKeyError: on access to a name without a score; a KeyError as well.
-    """
-
-    def __missing__(self, name: object) -> Score:
-        """Refuse a name without a score."""
-        raise UnknownKeyError(
-            f"no score of a metric {ascii(name)[:80]}",
-            where="scores",
-            expected="the name of a metric that was measured",
-            got=ascii(name)[:80],
-            fix=suggest_name(str(name), self),
-        )
-
-
 def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
     """Return the score of one metric, by the tallies of the scenarios.
 
     None where it was measured nowhere or the task is too short.
     """
     return aggregate([metric], tallies).get(metric.name)
-
-
-class _SeriesByStatistic:
-    """The statistics of some scenarios, each of shape [scenario, frame]."""
-
-    def __init__(self, tallies: Mapping[int, Tally]) -> None:
-        self.scenarios = tuple(sorted(tallies))
-        self._tallies = [tallies[i] for i in self.scenarios]
-        self.frames = self._tallies[0].frames
-        self._values: dict[str, Floats] = {}
-        self._measured: dict[str, NDArray[np.bool_]] = {}
-
-    def values(self, name: str) -> Floats:
-        """Return a statistic, NaN without a value."""
-        if name not in self._values:
-            rows = [tally.series(name) for tally in self._tallies]
-            self._values[name] = np.array(rows)
-        return self._values[name]
-
-    def measured(self, name: str) -> NDArray[np.bool_]:
-        """Return where a statistic was measured."""
-        if name not in self._measured:
-            rows = [tally.measured(name) for tally in self._tallies]
-            self._measured[name] = np.array(rows)
-        return self._measured[name]
-
-
-def _score(metric: Metric, statistics: _SeriesByStatistic) -> Score | None:
-    """Return the score of one metric.
-
-    None where it was measured nowhere or the task is too short.
-    """
-    is_measured = statistics.measured(metric.of[0])
-    for name in metric.of[1:]:
-        is_measured = is_measured & statistics.measured(name)
-    if metric.horizon > len(statistics.frames) or not is_measured.any():
-        return None
-    series = _series(metric, statistics)
-    values = _over_frames(metric, series)
-    undefined = np.count_nonzero(is_measured & np.isnan(series), axis=1)
-    return Score(
-        metric=metric,
-        scenarios=statistics.scenarios,
-        frames=statistics.frames,
-        per_frame=series,
-        values=values,
-        undefined=tuple(undefined.tolist()),
-    )
-
-
-def _series(metric: Metric, statistics: _SeriesByStatistic) -> Floats:
-    """Return the value of a metric per frame, shape [scenario, frame]."""
-    parts = [statistics.values(name) for name in metric.of]
-    if metric.series is identity:
-        return parts[0]
-    rows = []
-    for row_of_parts in zip(*parts, strict=True):
-        rows.append(metric.per_frame_from(*row_of_parts))
-    return np.stack(rows)
-
-
-def _over_frames(metric: Metric, series: Floats) -> Floats:
-    """Return the value of a metric over the horizon, shape [scenario]."""
-    # all rows at once, to the same bits
-    if metric.over_frames is mean:
-        return mean_of_rows(series)
-    if metric.over_frames is root_mean_square:
-        return np.asarray(np.sqrt(mean_of_rows(series**2)))
-    return np.array([metric.over_horizon(row) for row in series])
 
 
 def aggregate(
@@ -657,12 +496,46 @@ def aggregate(
     Raises:
         WorkFailedError: a metric gives no value per frame, or no number.
     """
-    scores = ScoresByMetric()
+    scores: dict[str, Score] = {}
     if not tallies:
         return scores
-    statistics = _SeriesByStatistic(tallies)
+    scenarios = tuple(sorted(tallies))
+    in_order = [tallies[i] for i in scenarios]
+    frames = in_order[0].frames
+    rows = {name: row for row, name in enumerate(in_order[0].names)}
+    # shape [statistic, scenario, frame]
+    values = np.stack([one.values for one in in_order], axis=1)
+    was_measured = np.stack([one.is_measured for one in in_order], axis=1)
+    values.flags.writeable = False
     for metric in metrics:
-        metric_score = _score(metric, statistics)
-        if metric_score is not None:
-            scores[metric.name] = metric_score
+        parts = [values[rows[name]] for name in metric.of]
+        is_measured = np.all([was_measured[rows[name]] for name in metric.of], axis=0)
+        if metric.horizon > len(frames) or not is_measured.any():
+            continue
+        try:
+            series = parts[0]
+            if metric.series is not identity:
+                by_scenario = zip(*parts, strict=True)
+                series = np.stack([metric.series(*part) for part in by_scenario])
+            if series.shape != parts[0].shape:
+                raise ValueError(f"shape {series.shape}, not {parts[0].shape}")
+            # all scenarios at once, to the same bits
+            if metric.over_frames is mean:
+                over_horizon = mean_of_rows(series)
+            elif metric.over_frames is root_mean_square:
+                over_horizon = np.sqrt(mean_of_rows(series**2))
+            else:
+                over_horizon = np.array([metric.over_frames(row) for row in series])
+            scores[metric.name] = Score(
+                metric=metric,
+                scenarios=scenarios,
+                frames=frames,
+                per_frame=np.asarray(series, np.float64),
+                values=np.asarray(over_horizon, np.float64),
+                undefined=tuple(
+                    np.count_nonzero(is_measured & np.isnan(series), axis=1).tolist()
+                ),
+            )
+        except Exception as error:
+            raise metric.failure(error, "over all frames") from error
     return scores

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -110,55 +110,37 @@ def _intact_share(snapshot: Snapshot, material: str) -> float:
     return scenario.bonds[material].intact_share(position)
 
 
-@dataclass(frozen=True)
-class OverBodies:
-    """Mean of a statistic over the elastic bodies of a scenario."""
+def over_bodies(
+    statistic: Callable[[FramePair, str], float], materials: tuple[str, ...]
+) -> Callable[[FramePair], float]:
+    """Return the mean of a statistic over the elastic bodies of some materials."""
 
-    # value of one body, by its material
-    statistic: Callable[[FramePair, str], float]
-    materials: tuple[str, ...]  # of the bodies that count
-
-    def __call__(self, pair: FramePair) -> float:
-        """Return the mean over the bodies of one frame pair."""
-        values = []
-        for material in self.materials:
-            if material in pair.scenario.members:
-                values.append(self.statistic(pair, material))
+    def mean_over_bodies(pair: FramePair) -> float:
+        members = pair.scenario.members
+        values = [statistic(pair, name) for name in materials if name in members]
         return float(np.mean(values))
+
+    return mean_over_bodies
 
 
 def _body_metrics(
     statistic: Callable[[FramePair, str], float],
     summary: str,
-    *,
-    unit: str,
-    direction: Direction,
-    perfect: float | None,
-    greatest: float | None = None,
+    **fields: Any,  # noqa: ANN401 - further fields of Metric
 ) -> Iterator[Metric]:
     """Yield a metric over all elastic bodies, then one for each elastic material."""
-    for material in (None, *ELASTIC):
-        if material is None:
-            suffix = ""
-            materials: tuple[str, ...] = ELASTIC
-            bodies = "mean over elastic bodies"
-        else:
-            suffix = f"_{material}"
-            materials = (material,)
-            bodies = material
-
+    for materials in (ELASTIC, *((material,) for material in ELASTIC)):
+        is_of_all = materials == ELASTIC
         yield Metric(
-            name=f"{statistic.__name__}{suffix}",
+            name=statistic.__name__ + ("" if is_of_all else f"_{materials[0]}"),
             family="bodies",
-            unit=unit,
-            direction=direction,
-            perfect=perfect,
             least=0.0,
-            greatest=greatest,
             source="section 4.8.2",
-            summary=f"{summary}, {bodies}",
-            statistic=OverBodies(statistic, materials),
+            summary=f"{summary}, "
+            + ("mean over elastic bodies" if is_of_all else materials[0]),
+            statistic=over_bodies(statistic, materials),
             applies=partial(has_material, materials=materials),
+            **fields,
         )
 
 
@@ -183,7 +165,6 @@ METRICS = (
         "Connectivity of the truth",
         unit="1",
         direction=Direction.NONE,
-        perfect=None,
         greatest=1.0,
     ),
 )

@@ -325,12 +325,8 @@ class Scenario:
         if len(shape) == 3 and shape[0] >= 2 and shape[1:] == self._frame_shape:
             return
         raise UsageError(
-            "the input frames do not fit the scenario",
+            f"shape {shape}; give 2 or more frames of shape {self._frame_shape}",
             where="input_positions",
-            expected=f"[2 or more frames, {len(self.material)} particles, "
-            f"{self.config.box.dimension}]",
-            got=str(shape),
-            fix="give positions [frame, particle, axis] of all its particles",
         )
 
     @property
@@ -397,24 +393,14 @@ class Scenario:
 
         expected = self._frame_shape
         if x.shape != expected or before.shape != expected:
-            raise UsageError(
-                "wrong shape of positions",
-                where="position and previous",
-                expected=str(expected),
-                got=f"{x.shape} and {before.shape}",
-                fix="give positions [particle, axis] of all its particles",
-            )
-
-        for name, points in (("position", x), ("previous", before)):
+            raise UsageError(f"shapes {x.shape} and {before.shape}, not {expected}")
+        for points in (x, before):
             is_finite = np.isfinite(points)
             if not is_finite.all():
                 count = np.count_nonzero(~is_finite.all(axis=1))
                 raise ChecksFailedError(
-                    "positions are not finite",
-                    where=name,
-                    expected="numbers",
-                    got=f"{count} of {len(points)} particles",
-                    fix="freeze the rollout at its last finite frame",
+                    f"{count} of {len(points)} particles are not at finite positions; "
+                    "freeze the rollout at its last finite frame"
                 )
 
         box = self.config.box

@@ -195,73 +195,32 @@ class Metric:
 
     def __post_init__(self) -> None:
         """Fill in ``of``; refuse a metric that is incomplete or has no usable name."""
-        self._convert_direction()
-        self._check_names()
-        if self.statistic is None and not self.of:
-            raise UsageError(
-                f"metric {self.name!r} has no statistic, own or of other metrics",
-                where="statistic and of",
-                expected="at least one of the two",
-                got="neither",
-                fix="decorate the function of the statistic, or name others by of=",
-            )
-        if self.perfect is None and self.direction is Direction.TARGET:
-            raise UsageError(
-                f"metric {self.name!r} has a target without a value",
-                where="perfect",
-                expected="the value of a perfect prediction",
-                got="none",
-                fix="add perfect=, as in perfect=1.0",
-            )
-        object.__setattr__(self, "of", tuple(self.of))
-        if not self.of:
-            object.__setattr__(self, "of", (self.name,))
-
-    def _convert_direction(self) -> None:
-        """Turn a direction that a package gives as text into a :class:`Direction`."""
-        try:
-            direction = Direction(self.direction)
-        except ValueError:
-            raise UsageError(
-                f"metric {self.name!r} has no such direction",
-                where="direction",
-                expected=", ".join(Direction),
-                got=repr(self.direction),
-                fix="name one of these",
-            ) from None
-        object.__setattr__(self, "direction", direction)
-
-    def _check_names(self) -> None:
-        """Refuse names that files and tables cannot hold."""
-        statistics: object = self.of
-        if isinstance(statistics, str):
-            raise UsageError(
-                f"metric {self.name!r} follows from a text, "
-                f"not from a tuple of statistics",
-                where="of",
-                expected=f"({statistics!r},)",
-                got=repr(statistics),
-                fix="add the comma",
-            )
-        if not isinstance(statistics, (tuple, list)):
-            raise UsageError(
-                f"metric {self.name!r} follows from no tuple of statistics",
-                where="of",
-                expected="a tuple of names",
-                got=repr(statistics)[:100],
-                fix="name statistics, as in of=('position_rmse',)",
-            )
-        for name in (self.name, *self.of):
+        names = tuple(self.of) or (self.name,)
+        for name in (self.name, *names):
             is_text = isinstance(name, str)
             if not is_text or not NAME.fullmatch(name) or name in RESERVED:
                 raise UsageError(
-                    f"no name for a metric: {name!r}",
-                    where="the name of a metric, or of",
-                    expected="up to 64 small letters, digits and underscores, "
-                    "as in my_error; not skill",
-                    got=repr(name)[:100],
-                    fix="rename it",
+                    f"{name!r:.80} names no metric; take up to 64 small letters, "
+                    "digits and underscores, as in my_error, not skill"
                 )
+        where = f"metric {self.name!r}"
+        if self.direction not in set(Direction):
+            raise UsageError(
+                f"no direction {self.direction!r}; name one of {', '.join(Direction)}",
+                where=where,
+            )
+        if isinstance(self.of, str):
+            raise UsageError(f"of is a text; write of=({self.of!r},)", where=where)
+        if self.statistic is None and not self.of:
+            raise UsageError(
+                "no statistic; decorate its function, or name others by of=",
+                where=where,
+            )
+        direction = Direction(self.direction)
+        if self.perfect is None and direction is Direction.TARGET:
+            raise UsageError("a target needs perfect=, as perfect=1.0", where=where)
+        object.__setattr__(self, "direction", direction)
+        object.__setattr__(self, "of", names)
 
     def measure(self, pair: FramePair) -> float:
         """Return the statistic of a frame pair, NaN where it is undefined.
@@ -277,34 +236,6 @@ class Metric:
             return float(self.statistic(pair))
         except Exception as error:
             raise self.failure(error, f"frame {pair.frame}") from error
-
-    def per_frame_from(self, *statistics: Floats) -> Floats:
-        """Return the value per frame from the statistics in ``of``, shape [frame].
-
-        Raises:
-            WorkFailedError: it has another shape, or its values are no numbers.
-        """
-        try:
-            series = np.asarray(self.series(*statistics), np.float64)
-        except Exception as error:
-            raise self.failure(error, "over all frames") from error
-        if series.shape != statistics[0].shape:
-            raise WorkFailedError(
-                f"the metric {self.name} gives shape {series.shape}, not one value per "
-                f"frame, {statistics[0].shape}; mend its series"
-            )
-        return series
-
-    def over_horizon(self, series: Floats) -> float:
-        """Return one number of a scenario from the value per frame.
-
-        Raises:
-            WorkFailedError: it is no number.
-        """
-        try:
-            return float(self.over_frames(series))
-        except Exception as error:
-            raise self.failure(error, "over the horizon") from error
 
     def failure(self, error: Exception, place: str) -> WorkFailedError:
         """Return the error for a function of the metric that fails."""
@@ -340,11 +271,7 @@ class Metric:
         """
         if self.direction is Direction.NONE:
             raise UsageError(
-                f"{self.name} is an observable: it ranks nothing",
-                where=self.name,
-                expected="a metric with a direction",
-                got="an observable",
-                fix="compare by another metric",
+                f"{self.name} is an observable, which ranks nothing; compare by another"
             )
         if self.direction is Direction.TARGET and self.perfect is not None:
             return abs(value - self.perfect)
@@ -373,6 +300,7 @@ def metric(
         perfect = 0.0
 
     def make_metric(function: Callable[..., Any]) -> Metric:
+        paragraph, _, _ = (function.__doc__ or "").strip().partition("\n\n")
         if of:
             fields.update(of=of, series=function)
         else:
@@ -383,23 +311,12 @@ def metric(
             unit=unit,
             direction=direction,
             source=source,
-            summary=_first_paragraph(function.__doc__ or "").rstrip("."),
+            summary=" ".join(paragraph.split()).rstrip("."),
             perfect=perfect,
             **fields,
         )
 
     return make_metric
-
-
-def observable(function: Callable[..., float]) -> Metric:
-    """Return the metric of a bare function of a frame pair: shown, and not judged."""
-    decorate = metric(unit="?", source="none", family="own")
-    return decorate(function)
-
-
-def _first_paragraph(docstring: str) -> str:
-    paragraph, _, _ = docstring.strip().partition("\n\n")
-    return " ".join(paragraph.split())
 
 
 def metrics_of(module: Mapping[str, object]) -> tuple[Metric, ...]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 
@@ -46,74 +45,53 @@ def attribute_mse(pair: FramePair) -> float:
     return average(squares / std**2)
 
 
-@dataclass(frozen=True)
-class ErrorMean:
-    """Mean of a particle error over all particles, or over those of one material."""
-
-    error: Callable[[FramePair], Floats]  # of all particles, shape [particle, axis]
-    norm: Callable[[Floats], float]  # mean squared or mean absolute error
-    material: str | None = None  # name of a material, None for all
-
-    def __call__(self, pair: FramePair) -> float:
-        """Return the mean for one frame pair."""
-        error = self.error(pair)
-        if self.material is None:
-            return self.norm(error)
-        return self.norm(error[pair.scenario.members[self.material]])
-
-    def applies(self, pair: FramePair) -> bool:
-        """Return whether the split has several materials and the scenario this one."""
-        if self.material is None:
-            return True
-        is_mixed = len(pair.scenario.config.materials) > 1
-        return is_mixed and self.material in pair.scenario.members
-
-
 def _errors(quantity: str, unit: str) -> Iterator[Metric]:
-    """Yield the errors of a quantity over all particles, then by material."""
-    for material in (None, *MATERIALS):
-        yield from _errors_of_material(quantity, unit, material)
-
-
-def _errors_of_material(
-    quantity: str, unit: str, material: str | None
-) -> Iterator[Metric]:
-    """Yield MSE, MAE and RMSE of a quantity."""
-    if material is None:
-        suffix = ""
-        particles = "all particles"
-    else:
-        suffix = f"_{material}"
-        particles = f"{material} particles"
-
+    """Yield MSE, MAE and RMSE of a quantity over all particles, then by material."""
     error = attrgetter(f"{quantity}_error")
-    squared = ErrorMean(error, mean_squared_error, material)
-    yield _error(
-        name=f"{quantity}_mse{suffix}",
-        unit=SQUARED[unit],
-        source="Eq. 3.3",
-        summary=f"Mean squared {quantity} error of {particles}",
-        statistic=squared,
-        applies=squared.applies,
-    )
-    absolute = ErrorMean(error, mean_absolute_error, material)
-    yield _error(
-        name=f"{quantity}_mae{suffix}",
-        unit=unit,
-        source="Eq. 3.4",
-        summary=f"Mean absolute {quantity} error of {particles}",
-        statistic=absolute,
-        applies=absolute.applies,
-    )
-    yield _error(
-        name=f"{quantity}_rmse{suffix}",
-        unit=unit,
-        source="Eq. 3.3",
-        summary=f"Root mean squared {quantity} error of {particles}",
-        of=(f"{quantity}_mse{suffix}",),
-        series=np.sqrt,
-        over_frames=root_mean_square,
-    )
+    for material in (None, *MATERIALS):
+        suffix = "" if material is None else f"_{material}"
+        particles = "all particles" if material is None else f"{material} particles"
+
+        def over_particles(
+            norm: Callable[[Floats], float], material: str | None = material
+        ) -> Callable[[FramePair], float]:
+            def mean_error(pair: FramePair) -> float:
+                if material is None:
+                    return norm(error(pair))
+                return norm(error(pair)[pair.scenario.members[material]])
+
+            return mean_error
+
+        def applies(pair: FramePair, material: str | None = material) -> bool:
+            # a material has errors of its own where there are several
+            is_mixed = len(pair.scenario.config.materials) > 1
+            return material is None or (is_mixed and material in pair.scenario.members)
+
+        yield _error(
+            name=f"{quantity}_mse{suffix}",
+            unit=SQUARED[unit],
+            source="Eq. 3.3",
+            summary=f"Mean squared {quantity} error of {particles}",
+            statistic=over_particles(mean_squared_error),
+            applies=applies,
+        )
+        yield _error(
+            name=f"{quantity}_mae{suffix}",
+            unit=unit,
+            source="Eq. 3.4",
+            summary=f"Mean absolute {quantity} error of {particles}",
+            statistic=over_particles(mean_absolute_error),
+            applies=applies,
+        )
+        yield _error(
+            name=f"{quantity}_rmse{suffix}",
+            unit=unit,
+            source="Eq. 3.3",
+            summary=f"Root mean squared {quantity} error of {particles}",
+            of=(f"{quantity}_mse{suffix}",),
+            series=np.sqrt,
+            over_frames=root_mean_square,
+        )
 
 
 def _over_rollouts(
@@ -125,23 +103,12 @@ def _over_rollouts(
     summary_to_frame: str,
 ) -> Iterator[Metric]:
     """Yield the metrics that reduce ``attribute_mse`` over the rollout, and over each
-    horizon.
-
-    Args:
-        name: name of the metric of the whole rollout.
-        reduction: returns the value of a series of frames.
-        source: where the metric is defined.
-        summary: of the metric of the whole rollout.
-        summary_to_frame: of the others; the number of the last frame follows.
+    horizon, the number of whose last frame ends the summary.
     """
     rollout = partial(
         _error, unit="1", source=source, of=("attribute_mse",), per_frame=False
     )
-    yield rollout(
-        name=name,
-        summary=summary,
-        over_frames=reduction,
-    )
+    yield rollout(name=name, summary=summary, over_frames=reduction)
     for horizon in HORIZONS:
         yield rollout(
             name=f"{name}_{horizon}",

@@ -56,15 +56,9 @@ def sign_flip_p(differences: ArrayLike) -> float:
     """
     signed = as_method(differences)
     d = np.abs(signed.ravel())
-    if not np.isfinite(d).all():
+    if np.isnan(d).any() or not 1 <= d.size <= MOST_SCENARIOS:
         raise UsageError(
-            "differences are not finite", expected="numbers", got="NaN or infinity"
-        )
-    if not 1 <= d.size <= MOST_SCENARIOS:
-        raise UsageError(
-            "the exact sign-flip test does not fit",
-            expected=f"1 to {MOST_SCENARIOS} scenarios",
-            got=d.size,
+            f"the sign-flip test takes 1 to {MOST_SCENARIOS} finite numbers"
         )
 
     # Sums of numbers near the largest float would be infinite. The factor is a power of
@@ -111,10 +105,7 @@ def differ(first: ArrayLike, second: ArrayLike) -> float:
     a = as_method(first)
     b = as_method(second)
     if a.shape[1] != b.shape[1]:
-        raise UsageError(
-            "methods over different scenarios", expected=a.shape[1], got=b.shape[1]
-        )
-
+        raise UsageError(f"{a.shape[1]} and {b.shape[1]} scenarios; give the same")
     is_undefined = np.isnan(a).all(axis=0) | np.isnan(b).all(axis=0)
     a = a[:, ~is_undefined]
     b = b[:, ~is_undefined]
@@ -148,10 +139,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     >>> holm([0.01, 0.04, 0.03])
     [0.03, 0.06, 0.06]
     """
-    defined = []
-    for i, p_value in enumerate(p_values):
-        if not math.isnan(p_value):
-            defined.append(i)
+    defined = [i for i, p_value in enumerate(p_values) if not math.isnan(p_value)]
     defined.sort(key=lambda i: (p_values[i], i))
 
     corrected = [math.nan] * len(p_values)
@@ -203,7 +191,7 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
     second_scores = _as_sequence(second)
     names = {score.metric.name for score in (*first_scores, *second_scores)}
     if len(names) != 1:
-        raise UsageError("scores of different metrics", got=" and ".join(sorted(names)))
+        raise UsageError(f"scores of different metrics: {', '.join(sorted(names))}")
 
     first_losses = [_losses(score) for score in first_scores]
     second_losses = [_losses(score) for score in second_scores]
@@ -221,9 +209,7 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
     seeds = (len(a), len(b))
     if paired:
         if len(a) != len(b):
-            raise UsageError(
-                "pairs of different numbers of seeds", got=f"{len(a)} and {len(b)}"
-            )
+            raise UsageError(f"{len(a)} and {len(b)} seeds; pairs need as many")
         a = a - b
         # a scenario that no seed has in both methods compares nothing
         is_defined = np.asarray(~np.isnan(a).all(axis=0))
@@ -265,10 +251,7 @@ def _losses(score: Score) -> dict[int, float]:
 
 def _table(seeds: Sequence[Mapping[int, float]], scenarios: Sequence[int]) -> Floats:
     """Return losses, NaN where undefined, shape [seed, scenario]."""
-    rows = []
-    for losses in seeds:
-        rows.append([losses.get(i, math.nan) for i in scenarios])
-    return np.array(rows)
+    return np.array([[one.get(i, math.nan) for i in scenarios] for one in seeds])
 
 
 def mean_loss(seeds: Seeds) -> float:
@@ -302,9 +285,7 @@ def standings(scores: Mapping[str, Seeds]) -> dict[str, Standing]:
     losses = {name: mean_loss(seeds) for name, seeds in scores.items()}
     order = sorted(scores, key=lambda name: (losses[name], name))
 
-    p_values = []
-    for name in order[1:]:
-        p_values.append(compare(scores[name], scores[order[0]]).p)
+    p_values = [compare(scores[name], scores[order[0]]).p for name in order[1:]]
     corrected = [math.nan, *holm(p_values)]
 
     ranked = {}

@@ -7,8 +7,6 @@ the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of the
 from __future__ import annotations
 
 import copyreg
-import importlib
-import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
@@ -39,7 +37,7 @@ from . import (
     vorticity,
 )
 from .frame import FramePair
-from .metric import Metric, observable
+from .metric import Metric, metric
 
 GROUP = "lagbench.metrics"
 """Entry-point group that adds metrics."""
@@ -135,20 +133,21 @@ def available() -> dict[str, Metric]:
         if point.value.startswith(f"{__package__}."):
             continue  # METRICS holds ours, whatever version of lagbench is installed
         try:
-            loaded_metrics = _load(point)
-        except Exception as error:  # importing a stranger's module may raise anything
-            _warn_of_package(point, _describe(error))
-            continue
-        for metric in loaded_metrics:
-            if metrics.setdefault(metric.name, metric) is metric:
+            value = point.load()
+            loaded = value if isinstance(value, Iterable) else (value,)
+            for metric in loaded:
+                if not isinstance(metric, Metric):
+                    raise UsageError(f"{metric!r:.80} is no lagbench.metrics.Metric")
+                if metrics.setdefault(metric.name, metric) is not metric:
+                    raise UsageError(f"the name {metric.name!r} is taken")
                 point_of[metric.name] = point
-            else:
-                _warn_of_package(point, f"the name {metric.name!r} is taken")
+        except Exception as error:  # importing a stranger's module may raise anything
+            is_ours = isinstance(error, LagbenchError)
+            _warn_of_package(
+                point, str(error) if is_ours else describe_exception(error)
+            )
 
-    statistics = set()
-    for name, metric in metrics.items():
-        if metric.statistic is not None:
-            statistics.add(name)
+    statistics = _statistics(metrics)
     for name, point in point_of.items():
         missing = sorted(set(metrics[name].of) - statistics)
         if missing:
@@ -168,31 +167,8 @@ def _warn_of_package(point: EntryPoint, reason: str) -> None:
     warnings.warn(message, PluginWarning, stacklevel=3)
 
 
-def _load(point: EntryPoint) -> Sequence[Metric]:
-    """Return the metrics of an entry point of another package."""
-    value = point.load()
-    metrics: tuple[object, ...] = (value,)
-    if isinstance(value, Iterable):
-        metrics = tuple(value)
-
-    checked = []
-    for metric in metrics:
-        if not isinstance(metric, Metric):
-            raise UsageError(
-                f"it has a {type(metric).__name__}, which is no metric",
-                where=point.value,
-                expected="a lagbench.metrics.Metric or a sequence of them",
-                got=type(metric).__name__,
-                fix="decorate its function: see docs/extending.md",
-            )
-        checked.append(metric)
-    return checked
-
-
-def _describe(error: Exception) -> str:
-    if isinstance(error, LagbenchError):
-        return error.what
-    return describe_exception(error)
+def _statistics(metrics: Mapping[str, Metric]) -> set[str]:
+    return {name for name, one in metrics.items() if one.statistic is not None}
 
 
 def own_metrics(values: object) -> tuple[Metric, ...]:
@@ -207,66 +183,37 @@ def own_metrics(values: object) -> tuple[Metric, ...]:
         UsageError: a value is neither a metric nor a function; its name is taken, or no
             name for a metric; or it follows from statistics that nothing measures.
     """
-    candidates: Iterable[object]
-    if isinstance(values, Metric) or callable(values):
-        candidates = (values,)
-    elif isinstance(values, Iterable) and not isinstance(values, str):
-        candidates = values
-    else:
-        raise _no_own_metric(values)
+    candidates: tuple[object, ...] = (values,)
+    if isinstance(values, Iterable) and not isinstance(values, str):
+        candidates = tuple(values)
     metrics = []
     table = available()
     for value in candidates:
-        if isinstance(value, Metric):
-            own = value
-        elif callable(value) and hasattr(value, "__name__"):
-            own = observable(value)
-        else:
-            raise _no_own_metric(value)
+        own = value
+        if callable(value) and hasattr(value, "__name__"):
+            own = metric(unit="?", source="none", family="own")(value)
+        if not isinstance(own, Metric):
+            raise UsageError(
+                f"{value!r:.60} is no metric; give a Metric or a named function of a "
+                "frame pair; built-in metrics are measured anyway",
+                where="metrics",
+            )
         if own.name in table:
             raise UsageError(
-                "another metric has the name",
-                where="metrics",
-                expected="a name of its own for each metric",
-                got=own.name,
-                fix="rename the function, or give Metric another name=",
+                f"the name {own.name} is taken; rename it", where="metrics"
             )
         table[own.name] = own
         metrics.append(own)
+    statistics = _statistics(table)
     for own in metrics:
-        _check_statistics(own, table)
+        for name in own.of:
+            if name not in statistics:
+                raise UsageError(
+                    f"{own.name} follows from {name!r}, which no metric measures; "
+                    f"{suggest_name(name, statistics)}",
+                    where="metrics",
+                )
     return tuple(metrics)
-
-
-def _no_own_metric(value: object) -> UsageError:
-    """Return the error for a value that is neither a metric nor a named function."""
-    fix = "write the function first: see docs/extending.md"
-    if isinstance(value, str):
-        fix = f"leave the name out: built-in metrics need no metrics=; or {fix}"
-    return UsageError(
-        "a value is no metric",
-        where="metrics",
-        expected="lagbench.metrics.Metric, or a named function of a frame pair",
-        got=f"{type(value).__name__}: {value!r:.60}",
-        fix=fix,
-    )
-
-
-def _check_statistics(own: Metric, table: Mapping[str, Metric]) -> None:
-    """Refuse a metric of a user that follows from what no metric measures."""
-    for name in own.of:
-        if name not in table or table[name].statistic is None:
-            statistics = []
-            for known_name, metric in table.items():
-                if metric.statistic is not None:
-                    statistics.append(known_name)
-            raise UsageError(
-                f"metric {own.name!r} follows from what no metric measures",
-                where="of",
-                expected="names of metrics with a statistic",
-                got=ascii(name),
-                fix=suggest_name(name, statistics),
-            )
 
 
 def select(
@@ -288,10 +235,11 @@ def select(
     """
     table = dict(available() if known is None else known)
     if names is None:
-        names = []
-        for metric in table.values():
-            if metric.extra is None or metric.extra in extras:
-                names.append(metric.name)
+        names = [
+            one.name
+            for one in table.values()
+            if one.extra is None or one.extra in extras
+        ]
 
     needed: set[str] = set()
     for choice in names:
@@ -301,75 +249,27 @@ def select(
         else:
             name = choice
         if name not in table:
-            raise UsageError(
-                f"no metric {name!r}",
-                where="names of metrics",
-                expected="the name of a metric that is installed",
-                got=ascii(name),
-                fix=suggest_name(name, table),
-            )
+            raise UsageError(f"no metric {name!r}; {suggest_name(name, table)}")
         needed.update((name, *table[name].of))
-    chosen_metrics = []
-    for name, metric in table.items():
-        if name in needed:
-            chosen_metrics.append(metric)
-    return tuple(chosen_metrics)
+    return tuple(one for name, one in table.items() if name in needed)
 
 
-def _reduce_metric(metric: Metric) -> str | tuple[Any, ...]:
-    """Return how pickle stores a metric: by its name, or by its place in a module.
+def _reduce_metric(one: Metric) -> str | tuple[Any, ...]:
+    """Return how pickle stores a metric: by its name where it is installed.
 
-    A decorated function cannot be pickled, as its name stands for the metric. A metric
-    that no name leads to is stored by its fields.
+    A decorated function cannot be pickled, as its name stands for the metric.
     """
-    if METRICS.get(metric.name) is metric:
-        return _installed_metric, (metric.name,)
-    place = _find_in_module(metric)
-    if place is not None:
-        return _metric_at, place
-    if available().get(metric.name) is metric:
-        return _installed_metric, (metric.name,)
-    return metric.__reduce_ex__(4)
-
-
-def _find_in_module(metric: Metric) -> tuple[str, str] | None:
-    """Return the module of a metric's function, and the metric's name in it."""
-    function: object = metric.series
-    if metric.statistic is not None:
-        function = metric.statistic
-    module_name = str(getattr(function, "__module__", None))
-    module = sys.modules.get(module_name)
-    if module is None:
-        return None
-    for name, value in list(vars(module).items()):
-        if value is metric:
-            return module_name, name
-    return None
-
-
-def _metric_at(module_name: str, name: str) -> object:
-    """Return a metric that was pickled by its place in a module."""
-    return getattr(importlib.import_module(module_name), name)
+    if METRICS.get(one.name) is one or available().get(one.name) is one:
+        return _installed_metric, (one.name,)
+    return one.__reduce_ex__(4)
 
 
 def _installed_metric(name: str) -> Metric:
-    """Return a metric that was pickled by its name.
-
-    Raises:
-        UsageError: no metric that is installed here has the name.
-    """
-    metric = METRICS.get(name)
-    if metric is None:
-        metric = available().get(name)
-    if metric is None:
-        raise UsageError(
-            f"no metric {name!r}",
-            where="an object that is unpickled",
-            expected="the name of a metric that is installed",
-            got=ascii(name),
-            fix="install the package that adds it",
-        )
-    return metric
+    """Return a metric that was pickled by its name."""
+    known = METRICS if name in METRICS else available()
+    if name not in known:
+        raise UsageError(f"no metric {name!r}; install the package that adds it")
+    return known[name]
 
 
 copyreg.pickle(Metric, _reduce_metric)

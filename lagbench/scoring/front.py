@@ -33,8 +33,8 @@ from lagbench.metrics.aggregate import (
     LEVEL,
     Score,
     mean_over_seeds,
-    quantiles,
     resampled_shares,
+    satterthwaite,
     student_quantile,
 )
 from lagbench.metrics.frame import Floats
@@ -285,14 +285,14 @@ def compute_speedup(model: FrontRow, rows: Sequence[FrontRow]) -> Speedup | NoSp
             of_seeds = np.zeros_like(parts[0])
             of_seeds[:, :1] = _drawn((offsets - np.mean(offsets))[None], stream=1)
             parts.append(of_seeds)
-        freedom = _freedom(
+        freedom = satterthwaite(
             [float(np.var(speedups(part))) for part in parts],
             [values.shape[1], len(offsets)],
         )
         upper = (1.0 + LEVEL) / 2.0
         stretch = student_quantile(freedom, upper) / student_quantile(1e6, upper)
         drawn = speedups(stretch * np.sum(parts, axis=0))
-        low, high = quantiles(drawn, (1.0 - upper, upper))
+        low, high = np.quantile(drawn, (1.0 - upper, upper)).tolist()
         interval = (low, high)
         below = np.count_nonzero(drawn <= 1.0)
         above = np.count_nonzero(drawn >= 1.0)
@@ -314,16 +314,6 @@ def _drawn(deviations: Floats, *, stream: int) -> Floats:
     count = deviations.shape[1]
     shares = resampled_shares(count, stream)
     return np.asarray(math.sqrt(count / (count - 1)) * shares @ deviations.T)
-
-
-def _freedom(variances: Sequence[float], counts: Sequence[int]) -> float:
-    """Return the degrees of freedom of a sum of variances, after Satterthwaite."""
-    squares = 0.0
-    for variance, count in zip(variances, counts, strict=False):
-        squares += variance**2 / (count - 1)
-    if squares:
-        return math.fsum(variances) ** 2 / squares
-    return math.inf
 
 
 def pays_after_holm(speedups: Mapping[str, Speedup]) -> list[str]:

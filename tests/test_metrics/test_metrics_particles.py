@@ -4,15 +4,12 @@ worked by hand.
 
 from __future__ import annotations
 
-import itertools
 import math
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from metric_flows import (
     CONFIG,
     Floats,
@@ -25,14 +22,13 @@ from metric_flows import (
     scenario_of,
 )
 from numpy.testing import assert_allclose
-from scipy.optimize import linear_sum_assignment, minimize_scalar
 
 from lagbench.data.grid import Grid, Placement
 from lagbench.errors import ChecksFailedError, NotInstalledError, UsageError
 from lagbench.metrics import METRICS, aggregate, select, tally
 from lagbench.metrics import measure as measure_all
 from lagbench.metrics.bodies import rigid_residual
-from lagbench.metrics.frame import Bonds, sliced_wasserstein2
+from lagbench.metrics.frame import Bonds
 from lagbench.metrics.pointwise import HORIZONS, attribute_mse
 from lagbench.metrics.transport import sinkhorn_divergence
 
@@ -52,21 +48,6 @@ def test_errors_of_two_particles_by_hand() -> None:
     )
     errors = measured(pair, "position_mse", "position_mae")
     assert errors == pytest.approx([0.025, 0.1])
-
-
-def test_velocity_is_a_frame_difference() -> None:
-    """Velocity errors come from positions of two frames: u = x(f) - x(f-1)."""
-    truth = rollout()
-    drift = 0.01 * np.arange(8)
-    prediction = truth + drift[:, None, None]
-    pairs = pairs_of(scenario_of(truth), truth, prediction)
-    # the first predicted frame moves by 0.02 against the last given frame of the truth
-    differences = [0.02, 0.01, 0.01, 0.01, 0.01, 0.01]
-    for pair, difference in zip(pairs, differences, strict=True):
-        mse = measure(pair, "velocity_mse")
-        mae = measure(pair, "velocity_mae")
-        assert mse == pytest.approx(difference**2, rel=1e-7)
-        assert mae == pytest.approx(difference, rel=1e-7)
 
 
 def test_attribute_error_equals_that_of_standardised_arrays() -> None:
@@ -186,21 +167,17 @@ def test_rmse_is_the_root_of_the_frame_mean() -> None:
 
 
 def test_what_cannot_be_measured_is_refused() -> None:
-    """A NaN position, which is counted; another number of particles, or a single given
-    frame.
-    """
+    """A NaN position, another number of particles, a single given frame."""
     x = lattice(4)
+    at_rest = np.zeros_like(x)
     y = x.copy()
     y[3, 1] = np.nan
-    at_rest = np.zeros_like(x)
-    fewer = x[:9]
     with pytest.raises(ChecksFailedError):
         pair_of(x, at_rest, at_rest, predicted_position=y)
-    with pytest.raises(ChecksFailedError) as caught:
+    with pytest.raises(ChecksFailedError):
         scenario_of(np.stack([x, x])).snapshot(x, y)
-    assert caught.value.where == "previous"
     with pytest.raises(UsageError):
-        pair_of(x, at_rest, at_rest[:9], predicted_position=fewer)
+        pair_of(x, at_rest, at_rest[:9], predicted_position=x[:9])
     with pytest.raises(UsageError):
         scenario_of(x[None])
 
@@ -214,37 +191,6 @@ def turned(points: Floats, angle: float) -> Floats:
     sin = math.sin(angle)
     rotation = np.array([[cos, sin], [-sin, cos]])
     return np.asarray(points @ rotation)
-
-
-SMALL_SHIFT = st.floats(-0.3, 0.3)
-
-
-@given(st.floats(-math.pi, math.pi), SMALL_SHIFT, SMALL_SHIFT)
-def test_rigid_motion_is_no_error(angle: float, dx: float, dy: float) -> None:
-    """A body that is turned and moved keeps its shape."""
-    x = 0.2 * lattice(5)
-    moved = turned(x, angle) + np.array([dx, dy])
-    assert rigid_residual(x, moved) < 1e-12
-
-
-@given(st.integers(0, 1000))
-def test_the_fit_is_the_best_of_all_angles(seed: int) -> None:
-    """No angle found by searching fits better than the closed form."""
-    rng = np.random.default_rng(seed)
-    points = rng.standard_normal((2, 6, 2))
-    t, p = points - points.mean(axis=1, keepdims=True)
-
-    def residual(angle: float) -> float:
-        difference = turned(p, angle) - t
-        square = np.sum(difference**2, axis=1)
-        return math.sqrt(np.mean(square))
-
-    starts = np.linspace(-math.pi, math.pi, 13)
-    smallest = []
-    for bounds in itertools.pairwise(starts):
-        search = minimize_scalar(residual, bounds=bounds)
-        smallest.append(search.fun)
-    assert rigid_residual(t, p) == pytest.approx(min(smallest), rel=1e-6)
 
 
 def test_rigid_residuals_by_hand() -> None:
@@ -344,7 +290,6 @@ def test_connectivity_speaks_of_prediction_and_truth() -> None:
     Liquid and snow flow and break: they have no shape to keep.
     """
     x = 0.2 * lattice(6)
-    x = 0.2 * lattice(6)
     at_rest = np.zeros_like(x)
     pair = pair_of(
         x,
@@ -368,57 +313,10 @@ def test_connectivity_speaks_of_prediction_and_truth() -> None:
             assert not metric.applies(fluid)
 
 
-SHIFT = st.floats(-0.5, 0.5, allow_subnormal=False)
-
-
 def cloud(seed: int, particles: int = 40) -> Floats:
     """Draw particles in the unit box."""
     rng = np.random.default_rng(seed)
     return rng.random((particles, 2))
-
-
-@given(st.integers(0, 99), SHIFT, SHIFT)
-def test_the_distance_of_a_shift_follows_from_its_length(
-    seed: int, dx: float, dy: float
-) -> None:
-    """Shifted by s: every projection moves by s.d, and the mean of its square is |s|^2
-    / 2.
-    """
-    x = cloud(seed)
-    shifted = x + np.array([dx, dy])
-    expected = math.hypot(dx, dy) / math.sqrt(2)
-    distance = sliced_wasserstein2(x, shifted)
-    assert distance == pytest.approx(expected, abs=1e-6)
-
-
-def test_a_scaled_cloud() -> None:
-    """Scaled by 1.5 about its middle: order is kept, W2^2 along d is 0.25
-    mean((r.d)^2).
-    """
-    x = cloud(0)
-    middle = x.mean(axis=0)
-    r = x - middle
-    mean_square = np.mean(np.sum(r**2, axis=1))
-    expected = math.sqrt(0.25 * mean_square / 2)
-    distance = sliced_wasserstein2(x, middle + 1.5 * r)
-    assert distance == pytest.approx(expected, rel=1e-5)
-
-
-@given(st.integers(0, 99))
-def test_slices_never_exceed_the_exact_distance(seed: int) -> None:
-    """In the plane SW2^2 <= W2^2 / 2, W2 from an exact assignment; particle order does
-    not count.
-    """
-    x = cloud(seed)
-    y = cloud(seed + 1000)
-    difference = x[:, None] - y[None]
-    cost = np.sum(difference**2, axis=-1)
-    rows, columns = linear_sum_assignment(cost)
-    square_distance = cost[rows, columns].mean()
-    sliced = sliced_wasserstein2(x, y)
-    assert sliced**2 <= square_distance / 2 + 1e-7
-    assert sliced == sliced_wasserstein2(x[::-1], y)
-    assert sliced_wasserstein2(x, x[::-1]) == 0.0
 
 
 def test_measured_at_frames_of_interest_and_the_last_only() -> None:
@@ -537,27 +435,23 @@ def motion_of(truth: Floats, guess: Floats, name: str = "motion_distance") -> fl
 ATTRIBUTE_STD = (0.3, 0.2, 0.03, 0.02)  # a velocity counts 1.5 * 10 frames
 
 
-def test_motion_distance_is_that_of_clouds_where_velocities_agree() -> None:
+def test_motion_distance_sees_errors_of_clouds_and_of_velocities() -> None:
+    """A shift; a velocity of which the clouds know nothing; particles that are mixed up
+    since the frame before.
+    """
     truth = rollout(frames=12)
-    guess = truth + np.array([0.1, 0.0])
-    assert motion_of(truth, guess) == pytest.approx(0.1 / math.sqrt(2), rel=1e-4)
+    shifted = truth + np.array([0.1, 0.0])
+    assert motion_of(truth, shifted) == pytest.approx(0.1 / math.sqrt(2), rel=1e-4)
 
+    faster = truth.copy()
+    faster[10] += [0.01, 0.0]
+    assert motion_of(truth, faster) == pytest.approx(0.15 / math.sqrt(2), rel=1e-4)
 
-def test_motion_distance_sees_an_error_of_the_velocity() -> None:
-    truth = rollout(frames=12)
-    guess = truth.copy()
-    guess[10] += [0.01, 0.0]
-    assert motion_of(truth, guess, "cloud_distance") < 1e-6
-    assert motion_of(truth, guess) == pytest.approx(0.15 / math.sqrt(2), rel=1e-4)
-
-
-def test_motion_distance_sees_shuffled_identities() -> None:
-    truth = rollout(frames=12)
-    order = np.random.default_rng(0).permutation(truth.shape[1])
-    guess = truth.copy()
-    guess[11] = guess[11][order]
-    assert motion_of(truth, guess, "cloud_distance") < 1e-6
-    assert motion_of(truth, guess) > 1.0
+    mixed = truth.copy()
+    mixed[11] = mixed[11][np.random.default_rng(0).permutation(truth.shape[1])]
+    assert motion_of(truth, mixed) > 1.0
+    for guess in (faster, mixed):
+        assert motion_of(truth, guess, "cloud_distance") < 1e-6
 
 
 @pytest.mark.slow
@@ -583,16 +477,3 @@ def test_sinkhorn_of_a_shift(monkeypatch: pytest.MonkeyPatch) -> None:
     assert far == pytest.approx(0.08, rel=1e-3)
     outside = sinkhorn_divergence(x, x + np.array([9.0, 0.0]))
     assert outside == pytest.approx(81.0, rel=1e-2)
-
-
-@pytest.mark.slow
-def test_sinkhorn_sees_a_particle_far_outside() -> None:
-    """One of n particles that lies d away costs about d^2 / n; NaN is no distance."""
-    pytest.importorskip("ot")
-    x = cloud(0)
-    stray = x.copy()
-    stray[0, 0] += 12.0
-    cost = sinkhorn_divergence(x, stray)
-    assert cost == pytest.approx(12.0**2 / len(x), rel=0.1)
-    stray[0, 0] = np.nan
-    assert math.isnan(sinkhorn_divergence(x, stray))
