@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.drawn import drawn_root, drawn_size
-from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.metrics.aggregate import Tally, score
-from lagbench.metrics.frame import snapshots
-from lagbench.metrics.table import METRICS, select
+from lagbench.metrics.metric import Metric
+from lagbench.metrics.table import METRICS
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import shipped
 from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.scoring.references import check_train
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import best_reference
-from lagbench.scoring.task import (
-    SUBMISSION,
-    load_scored_task,
-    measure_rows,
-    predict_reference,
-)
-from lagbench.work.run import Meter, Progress
+from lagbench.scoring.task import load_scored_task, predict_reference
+from lagbench.work.run import Progress
 
-from .entry import Entry
-from .folder import Folder
-from .models import choose_entries, name_seed, open_model, predict_tallies
+from .models import ModelRuns, name_seed, score_positions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,98 +67,53 @@ def score_blind(
         DataError: the scenarios are not generated, or were drawn from another seed.
         ChecksFailedError: a model is not the one that its entry names.
     """
-    folder = Folder(board)
-    folder.require()
-    data_root = resolve_root(root)
-    rooted = load_rooted_registry(data_root, registry)
-    chosen = choose_entries(folder, entries, rooted, split=split, size=size)
-    meter = Meter(progress)
+    runs = ModelRuns.of(
+        board, threads=threads, root=root, registry=registry, progress=progress
+    )
     scores = []
-    for entry in chosen:
-        scores += _score_entry(
-            folder,
-            entry,
-            draw_seed,
-            threads=threads,
-            root=data_root,
-            registry=rooted,
-            meter=meter,
+    for entry in runs.choose(entries, split=split, size=size):
+        public_size = runs.size(entry)
+        task = load_scored_task(
+            drawn_size(public_size, draw_seed), drawn_root(runs.root, draw_seed)
         )
-    return scores
-
-
-def _score_entry(
-    folder: Folder,
-    entry: Entry,
-    draw_seed: str,
-    *,
-    threads: int,
-    root: Path,
-    registry: Registry,
-    meter: Meter,
-) -> list[BlindScore]:
-    public_size = registry.size(entry.split, entry.size)
-    size = drawn_size(public_size, draw_seed)
-    task = load_scored_task(size, drawn_root(root, draw_seed))
-    metric = METRICS[entry.score.ranking_metric]
-
-    naive_scores = {}
-    for name, reference in (shipped(public_size) or {}).items():
-        if name in NAIVE and metric.name in reference.scores:
-            naive_scores[name] = reference.scores[metric.name]
-    best = best_reference(naive_scores)
-    public_naive = blind_naive = float("nan")
-    if best is not None:
-        public_naive = naive_scores[best].mean
-        check_train(public_size, root, [best])
-        naive_tallies: dict[int, Tally] = {}
-        for scenario in task.scenarios:
-            with task.opened(scenario) as truth:
-                given = given_in(truth.file, public_size, root)
-                frames = predict_reference(REFERENCES[best], given)
-                rows = {SUBMISSION: snapshots(truth.scenario, frames)}
-                tallies, _ = measure_rows(
-                    truth.scenario,
-                    truth.snapshots(),
-                    rows,
-                    metrics=select([metric.name]),
+        metric = METRICS[entry.score.ranking_metric]
+        naive_scores = {}
+        for name, reference in (shipped(public_size) or {}).items():
+            if name in NAIVE and metric.name in reference.scores:
+                naive_scores[name] = reference.scores[metric.name]
+        best = best_reference(naive_scores)
+        public_naive = blind_naive = math.nan
+        if best is not None:
+            public_naive = naive_scores[best].mean
+            check_train(public_size, runs.root, [best])
+            naive_tallies = {}
+            for scenario in task.scenarios:
+                with task.opened(scenario) as truth:
+                    given = given_in(truth.file, public_size, runs.root)
+                    frames = predict_reference(REFERENCES[best], given)
+                naive_tallies[scenario] = score_positions(
+                    task, scenario, frames, metric.name
                 )
-            naive_tallies[scenario] = tallies[SUBMISSION]
-        naive = score(metric, naive_tallies)
-        if naive is not None:
-            blind_naive = naive.mean
+            blind_naive = _mean(metric, naive_tallies)
 
-    scores = []
-    for index, prediction in enumerate(entry.predictions):
-        if prediction.weights is None:
-            continue
-        name = name_seed(entry, prediction)
-        model = open_model(
-            folder, entry, prediction, root=root, registry=registry, threads=threads
-        )
-        meter.begin(name, total=len(task.scenarios), scenarios=len(task.scenarios))
-        try:
-            model_tallies = predict_tallies(
-                model,
-                task,
-                metric.name,
-                task.scenarios,
-                done=lambda: meter.count(1, scenarios=1),
+        for index, prediction in enumerate(entry.predictions):
+            if prediction.weights is None:
+                continue
+            stored = read_statistics(runs.folder.path / entry.score_paths[index])
+            public = _mean(metric, stored.tallies)
+            blind = _mean(metric, runs.tallies(entry, prediction, task, task.scenarios))
+            scores.append(
+                BlindScore(
+                    name=name_seed(entry, prediction),
+                    public=public,
+                    blind=blind,
+                    public_skill=1.0 - public / public_naive,
+                    blind_skill=1.0 - blind / blind_naive,
+                )
             )
-        finally:
-            model.close()
-        stored = read_statistics(folder.path / entry.score_paths[index])
-        public = score(metric, stored.tallies)
-        blind = score(metric, model_tallies)
-        public_mean = float("nan") if public is None else public.mean
-        blind_mean = float("nan") if blind is None else blind.mean
-        scores.append(
-            BlindScore(
-                name=name,
-                public=public_mean,
-                blind=blind_mean,
-                public_skill=1.0 - public_mean / public_naive,
-                blind_skill=1.0 - blind_mean / blind_naive,
-            )
-        )
     return scores
+
+
+def _mean(metric: Metric, tallies: Mapping[int, Tally]) -> float:
+    formed = score(metric, tallies)
+    return math.nan if formed is None else formed.mean

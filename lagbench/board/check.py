@@ -24,7 +24,6 @@ from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import (
-    SubmissionStatistics,
     read_statistics,
     write_statistics,
 )
@@ -114,8 +113,13 @@ def check_board(
         entries[path.as_posix()] = entry
         issues += check_entry(folder, path, entry, size)
     for path in folder.reference_files():
-        issues += _check_reference(folder, path, known)
-
+        try:
+            read_statistics(folder.path / path, known.size(*path.parts[1:3]))
+        except LagbenchError as error:
+            issues.append(str(error))
+            continue
+        if path.stem not in REFERENCES:
+            issues.append(f"{path}: no such reference predictor; remove the file")
     issues += _check_strays(folder, entries)
     issues += check_verified(folder, entries)
     issues += check_shift(folder, entries, known)
@@ -138,12 +142,18 @@ def check_board(
             confirmed.append(_rescore(folder, path, card, entries))
         except ChecksFailedError as error:
             issues.append(str(error))
+
+    def scored_again(line: Verification) -> Verification:
+        if line.level is not Level.AS_SUBMITTED:
+            return line
+        return line.model_copy(update={"level": Level.SCORED_AGAIN})
+
     recorded = []
     if recording and not issues:
         files = {one.score_file for one in confirmed}
         for name, entry in entries.items():
             if files.issuperset(path.as_posix() for path in entry.score_paths):
-                record(folder, entry, _raise_to_scored_again)
+                record(folder, entry, scored_again)
                 recorded.append(name)
     return CheckResult(
         folder=folder.path,
@@ -209,19 +219,13 @@ def check_entry(folder: Folder, path: Path, entry: Entry, size: Size) -> Iterato
             if found[name] != value:
                 yield f"{score_path}: {name} {ascii(found[name])[:80]}, not {value}"
         stored.append(scores)
-    if len(stored) == len(entry.predictions):
-        yield from _check_score_block(path, entry, stored)
+    if len(stored) < len(entry.predictions):
+        return
 
-
-def _check_score_block(
-    path: Path, entry: Entry, stored: Sequence[SubmissionStatistics]
-) -> Iterator[str]:
-    """Compare the score block of an entry with its score files."""
     first = stored[0]
-    for scores in stored[1:]:
-        if sorted(scores.tallies) != sorted(first.tallies):
-            yield f"{path}: the score files of its seeds have other scenarios"
-            return
+    if any(one.tallies.keys() != first.tallies.keys() for one in stored):
+        yield f"{path}: the score files of its seeds have other scenarios"
+        return
     if entry.score.ranking_metric != first.ranking:
         yield f"{path}: ranking_metric is not {first.ranking}"
     formed = summarise(combine([scores.tallies for scores in stored]))
@@ -242,18 +246,6 @@ def _is_same_summary(first: Summary, second: Summary) -> bool:
     return True
 
 
-def _check_reference(folder: Folder, path: Path, registry: Registry) -> Iterator[str]:
-    """Yield why a file cannot hold the scores of a reference predictor."""
-    try:
-        size = registry.size(*path.parts[1:3])
-        read_statistics(folder.path / path, size)
-    except LagbenchError as error:
-        yield str(error)
-        return
-    if path.stem not in REFERENCES:
-        yield f"{path}: no reference predictor has this name; remove the file"
-
-
 def _check_strays(folder: Folder, entries: Mapping[str, Entry]) -> Iterator[str]:
     """Yield files that no entry names, and weights beyond the size of all."""
     named: set[Path] = set()
@@ -267,20 +259,12 @@ def _check_strays(folder: Folder, entries: Mapping[str, Entry]) -> Iterator[str]
         for path in (*folder.files(SCORES), *folder.files(WEIGHTS)):
             if path not in named:
                 yield f"{path}: no entry names it; remove it"
-    total = 0
-    for path in folder.files(WEIGHTS):
-        total += (folder.path / path).stat().st_size
+    total = sum((folder.path / one).stat().st_size for one in folder.files(WEIGHTS))
     if total > MOST_WEIGHTS:
         yield (
             f"the weights have {total} bytes, at most {MOST_WEIGHTS} in all; name "
             "larger ones by `weights: https://...` in the entry"
         )
-
-
-def _raise_to_scored_again(line: Verification) -> Verification:
-    if line.level is not Level.AS_SUBMITTED:
-        return line
-    return line.model_copy(update={"level": Level.SCORED_AGAIN})
 
 
 def _rescore(

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from lagbench.submission.truth import frames_to_predict
 from .entry import Entry, Status, data_set_of, is_current, read_entry
 from .folder import Folder
 from .gates import EARLY_ERROR, gates_failed_by, read_failed_gates, with_early_gate
-from .ranking import combine
+from .ranking import CombinedScore, combine, combine_seeds
 from .rows import TRIAL, Board, Curve, Row, Tab, Value
 from .shift import SUBSET, ShiftScores, read_shift, scores_of_seeds, shift_of
 from .verified import MeasuredCost, Verification, read_verified, verification_of
@@ -50,9 +51,8 @@ def list_data_sets(folder: Folder, registry: Registry) -> list[tuple[str, str]]:
     They have entries; or the package has scores of their reference predictors, and the
     board has entries of that size.
     """
-    with_entries = folder.data_sets()
-    sizes = {size for _, size in with_entries} - {TRIAL}
-    shown = list(with_entries)
+    shown = list(folder.data_sets())
+    sizes = {size for _, size in shown} - {TRIAL}
     for split, description in registry.splits.items():
         for size in description.sizes:
             is_new = size in sizes and (split, size) not in shown
@@ -139,50 +139,91 @@ class BoardRecords:
 def _make_tab(
     records: BoardRecords, size: Size, title: str, entries: Sequence[Entry]
 ) -> Tab:
-    scenarios = tuple(sorted(size.subsets["test"]))
     ranking = ranking_metric(size)
-    references = _read_references(records.folder, size)
-    scores = {}
-    for reference in references:
+    references = []
+    for reference in _read_references(records.folder, size):
         if ranking in reference.scores:
-            scores[reference.name] = reference.scores[ranking]
-    naive = _naive_among(scores)
+            references.append(reference)
     on_shift = {}
     if SUBSET in size.subsets:
         for name, reference in (shipped(size.scored_on(SUBSET)) or {}).items():
             if name in REFERENCES and ranking in reference.scores:
                 on_shift[name] = reference.scores[ranking]
+    naive = _naive_among({one.name: one.scores[ranking] for one in references})
+    naive_on_shift = _naive_among(on_shift)
+    verifications = {
+        entry.method: verification_of(entry, records.verified) for entry in entries
+    }
+    costs = FrameCosts.of(size, [one for one in verifications.values() if one])
 
-    verifications = {}
-    for entry in entries:
-        verifications[entry.method] = verification_of(entry, records.verified)
-    costs = FrameCosts.of(
-        size, [one for one in verifications.values() if one is not None]
-    )
+    def make_row(
+        combined: Mapping[str, CombinedScore],
+        shift_seeds: Sequence[Score],
+        **keys: Any,  # noqa: ANN401 - the other fields of a row
+    ) -> Row:
+        """Return a row, without what follows from the other rows."""
+        metrics = {}
+        for name, one in combined.items():
+            low, high = one.interval
+            metrics[name] = Value(mean=one.score.mean, std=one.std, low=low, high=high)
+        seeds = []
+        for seed in combined[ranking].seeds:
+            # values per frame take most of the memory
+            seeds.append(replace(seed, per_frame=np.empty((len(seed.values), 0))))
+        return Row(
+            metrics=metrics,
+            seeds=seeds,
+            curve=_make_curve(combined[ranking].score),
+            skill=_skill(seeds, naive),
+            shift_skill=_skill(shift_seeds, naive_on_shift) if shift_seeds else None,
+            **keys,
+        )
 
     rows = []
     for entry in entries:
-        row = _read_row(
-            records,
-            entry,
-            size,
-            verified=verifications[entry.method],
-            costs=costs,
-            naive=naive,
-            on_shift=on_shift,
-        )
-        rows.append(row)
-    for reference in references:
-        if ranking in reference.scores:
-            row = _reference_row(
-                records,
-                reference,
-                ranking,
-                costs=costs,
-                naive=naive,
-                on_shift=on_shift,
+        names = None
+        if records.metrics is not None:
+            names = {*records.metrics, ranking, EARLY_ERROR}
+        tallies = []
+        for path in entry.score_paths:
+            tallies.append(read_statistics(records.folder.path / path, size).tallies)
+        combined = combine(tallies, names)
+        if ranking not in combined:
+            raise ChecksFailedError(
+                f"{entry.yaml_path}: its score files lack {ranking}"
             )
-            rows.append(row)
+        shift = shift_of(entry, size, records.shift)
+        verified = verifications[entry.method]
+        rows.append(
+            make_row(
+                combined,
+                scores_of_seeds(shift) if shift is not None else (),
+                id=entry.method,
+                name=entry.name,
+                kind=entry.kind,
+                entry=entry,
+                verified=verified,
+                seconds=costs.of_entry(entry, verified),
+                failed_gates=gates_failed_by(entry, records.failed_gates),
+            )
+        )
+    for reference in references:
+        combined = {}
+        for name, one in reference.scores.items():
+            if records.metrics is None or name in {*records.metrics, ranking}:
+                combined[name] = combine_seeds([one])
+        rows.append(
+            make_row(
+                combined,
+                [on_shift[reference.name]] if reference.name in on_shift else (),
+                id=reference.name,
+                name=reference.name,
+                kind=REFERENCES[reference.name].kind,
+                entry=None,
+                verified=None,
+                seconds=costs.of_reference(reference),
+            )
+        )
 
     rows = with_early_gate(rows, records.failed_gates)
     rows.sort(key=lambda row: (mean_loss(row.seeds), row.id))
@@ -190,7 +231,7 @@ def _make_tab(
         size=size,
         title=title,
         ranking=ranking,
-        scenarios=scenarios,
+        scenarios=tuple(sorted(size.subsets["test"])),
         rows=tuple(rows),
         solver_seconds=costs.solver,
     )
@@ -259,105 +300,10 @@ class FrameCosts:
         )
 
 
-def _read_row(
-    records: BoardRecords,
-    entry: Entry,
-    size: Size,
-    *,
-    verified: Verification | None,
-    costs: FrameCosts,
-    naive: Mapping[str, Score],
-    on_shift: Mapping[str, Score],
-) -> Row:
-    """Return the row of an entry, without what follows from the other rows."""
-    ranking = ranking_metric(size)
-    names = None
-    if records.metrics is not None:
-        names = {*records.metrics, ranking, EARLY_ERROR}
-    stored = []
-    for path in entry.score_paths:
-        stored.append(read_statistics(records.folder.path / path, size))
-    combined = combine([scores.tallies for scores in stored], names)
-    if ranking not in combined:
-        raise ChecksFailedError(f"{entry.yaml_path}: its score files lack {ranking}")
-    metrics = {}
-    for name, one in combined.items():
-        low, high = one.interval
-        metrics[name] = Value(mean=one.score.mean, std=one.std, low=low, high=high)
-    seeds = [_without_frames(seed) for seed in combined[ranking].seeds]
-
-    shift_score = shift_skill = None
-    shift_scores = shift_of(entry, size, records.shift)
-    if shift_scores is not None:
-        seeds_on_shift = scores_of_seeds(shift_scores)
-        shift_score = mean_loss(seeds_on_shift)
-        shift_skill = _skill(seeds_on_shift, _naive_among(on_shift))
-    return Row(
-        id=entry.method,
-        name=entry.name,
-        kind=entry.kind,
-        entry=entry,
-        verified=verified,
-        metrics=metrics,
-        seeds=seeds,
-        curve=_make_curve(combined[ranking].score),
-        seconds=costs.of_entry(entry, verified),
-        skill=_skill(seeds, naive),
-        shift_score=shift_score,
-        shift_skill=shift_skill,
-        failed_gates=gates_failed_by(entry, records.failed_gates),
-    )
-
-
-def _reference_row(
-    records: BoardRecords,
-    reference: ReferenceScores,
-    ranking: str,
-    *,
-    costs: FrameCosts,
-    naive: Mapping[str, Score],
-    on_shift: Mapping[str, Score],
-) -> Row:
-    """Return the row of a reference predictor."""
-    metrics = {}
-    for name, score in reference.scores.items():
-        if records.metrics is None or name in records.metrics or name == ranking:
-            low, high = score.interval
-            metrics[name] = Value(mean=score.mean, low=low, high=high)
-    seeds = [_without_frames(reference.scores[ranking])]
-    shift_score = shift_skill = None
-    if reference.name in on_shift:
-        seed_on_shift = on_shift[reference.name]
-        shift_score = seed_on_shift.mean
-        shift_skill = _skill([seed_on_shift], _naive_among(on_shift))
-    return Row(
-        id=reference.name,
-        name=reference.name,
-        kind=REFERENCES[reference.name].kind,
-        entry=None,
-        verified=None,
-        metrics=metrics,
-        seeds=seeds,
-        curve=_make_curve(reference.scores[ranking]),
-        seconds=costs.of_reference(reference),
-        skill=_skill(seeds, naive),
-        shift_score=shift_score,
-        shift_skill=shift_skill,
-    )
-
-
 def _naive_among(scores: Mapping[str, Score]) -> dict[str, Score]:
-    """Return the scores of the naive baselines."""
-    naive = {}
-    for name, score in scores.items():
-        if REFERENCES[name].kind is Kind.NAIVE:
-            naive[name] = score
-    return naive
-
-
-def _without_frames(score: Score) -> Score:
-    """Return a score without its values per frame, which take most of the memory."""
-    return replace(score, per_frame=np.empty((len(score.values), 0)))
+    return {
+        name: one for name, one in scores.items() if REFERENCES[name].kind is Kind.NAIVE
+    }
 
 
 def _skill(seeds: Sequence[Score], naive: Mapping[str, Score]) -> Value | None:
@@ -388,6 +334,8 @@ def _make_curve(score: Score) -> Curve | None:
 def _with_speedups(tab: Tab) -> list[Row]:
     """Return the rows of a tab with speedup and break-even of the models."""
     size = tab.size
+    frames = size.frames if isinstance(size.frames, int) else max(size.frames)
+    train = len(size.subsets.get("train", ()))
     front_rows = tab.front_rows
     rows = []
     for row, front in zip(tab.rows, front_rows, strict=True):
@@ -399,8 +347,17 @@ def _with_speedups(tab: Tab) -> list[Row]:
             rows.append(replace(row, why_no_speedup=speedup))
             continue
         after = None
-        hours = _hours(row.entry, size, tab.solver_seconds)
-        if hours is not None and row.seconds is not None and row.kind.has_network:
+        budget = row.entry.budget
+        if (
+            row.kind.has_network
+            and row.seconds is not None
+            and tab.solver_seconds is not None
+            and budget is not None
+            and budget.cpu_hours is not None
+        ):
+            # of the data for it, and of its training
+            generation = tab.solver_seconds * frames * train / 3600.0
+            hours = generation + budget.cpu_hours + (budget.gpu_hours or 0.0)
             after = breakeven(
                 speedup,
                 seconds_per_frame=row.seconds,
@@ -409,21 +366,6 @@ def _with_speedups(tab: Tab) -> list[Row]:
             )
         rows.append(replace(row, speedup=speedup, breakeven=after))
     return rows
-
-
-def _hours(entry: Entry, size: Size, solver: float | None) -> float | None:
-    """Return the processor time to generate train and to train once [h].
-
-    None where one of them is not known.
-    """
-    budget = entry.budget
-    if budget is None or budget.cpu_hours is None or solver is None:
-        return None
-    frames = size.frames
-    if not isinstance(frames, int):
-        frames = max(frames)
-    generation = solver * frames * len(size.subsets.get("train", ())) / 3600.0
-    return generation + budget.cpu_hours + (budget.gpu_hours or 0.0)
 
 
 def _rank(rows: Sequence[Row], truth_error: float | None) -> tuple[Row, ...]:
@@ -469,11 +411,7 @@ def _read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
     """
     shipped_scores = shipped(size)
     if shipped_scores:
-        known_references = []
-        for reference in shipped_scores.values():
-            if reference.name in REFERENCES:
-                known_references.append(reference)
-        return tuple(known_references)
+        return tuple(one for one in shipped_scores.values() if one.name in REFERENCES)
 
     references = []
     for path in folder.reference_files(size.split, size.name):
@@ -484,13 +422,10 @@ def _read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
             continue
         read_statistics(file, size)  # refuses scores that do not fit the task
         combined = combine([stored.tallies])
-        scores = {}
-        for name, combined_score in combined.items():
-            scores[name] = combined_score.score
         references.append(
             ReferenceScores(
                 name=path.stem,
-                scores=scores,
+                scores={name: one.score for name, one in combined.items()},
                 seconds_per_frame=math.nan,
                 correlation=np.empty(0),
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import METRICS
@@ -97,9 +97,7 @@ def value_cell(value: Value | None) -> Cell:
 def _rank(row: Row) -> Cell:
     if row.rank is None:
         return Cell(text="")
-    text = str(row.rank)
-    if row.tied:
-        text += " ≈"
+    text = f"{row.rank} ≈" if row.tied else str(row.rank)
     note = ""
     if row.rank_range is not None and row.rank_range[0] < row.rank_range[1]:
         note = f"{row.rank_range[0]}–{row.rank_range[1]}"
@@ -116,27 +114,12 @@ def _method(row: Row) -> Cell:
     return Cell(text=row.name, note=", ".join(notes))
 
 
-def _score(row: Row) -> Cell:
-    return value_cell(row.score)
-
-
-def _skill(row: Row) -> Cell:
-    return value_cell(row.skill)
-
-
-def _shift(row: Row) -> Cell:
-    return value_cell(row.shift_skill)
-
-
 def _speedup(row: Row) -> Cell:
     if row.speedup is None:
         return Cell(text=NOTHING if row.entry is not None else "")
-    speedup = row.speedup
-    sign = "> " if speedup.at_least else ""
-    cell = value_cell(
-        Value(mean=speedup.value, low=speedup.interval[0], high=speedup.interval[1])
-    )
-    return Cell(text=f"{sign}{cell.text}", order=cell.order, note=cell.note)
+    low, high = row.speedup.interval
+    cell = value_cell(Value(mean=row.speedup.value, low=low, high=high))
+    return replace(cell, text="> " + cell.text) if row.speedup.at_least else cell
 
 
 def _breakeven(row: Row) -> Cell:
@@ -223,7 +206,7 @@ MAIN_COLUMNS = (
         label="score",
         group="main",
         meaning="The metric that ranks, and its 95 % interval.",
-        read=_score,
+        read=lambda row: value_cell(row.score),
         direction=Direction.LOWER,
     ),
     Column(
@@ -231,7 +214,7 @@ MAIN_COLUMNS = (
         label="skill",
         group="main",
         meaning="1 - score / score of the best naive baseline.",
-        read=_skill,
+        read=lambda row: value_cell(row.skill),
         direction=Direction.HIGHER,
     ),
     Column(
@@ -264,7 +247,7 @@ MAIN_COLUMNS = (
         label="skill on shift",
         group="main",
         meaning="Skill on the subset shift, which lies outside train on purpose.",
-        read=_shift,
+        read=lambda row: value_cell(row.shift_skill),
         direction=Direction.HIGHER,
     ),
     Column(

@@ -85,12 +85,6 @@ def _check_date(date: datetime.date) -> datetime.date:
     return date
 
 
-def _check_kind(kind: Kind) -> Kind:
-    if kind is Kind.NAIVE:
-        raise ValueError("an entry is learned, hybrid, calibrated or classical")
-    return kind
-
-
 def today() -> datetime.date:
     """Return the date of an entry or a record that is written now."""
     return datetime.datetime.now(datetime.UTC).date()
@@ -320,7 +314,7 @@ class About(Strict):
     weights: Link | None = None
     date: Date | None = None
     notes: Long = ""
-    kind: Annotated[Kind, Field(strict=False), AfterValidator(_check_kind)] = Field(
+    kind: Annotated[Kind, Field(strict=False)] = Field(
         default=Kind.LEARNED,
         description="learned, hybrid (a solver with a network inside), calibrated (a "
         "solver with fitted constants) or classical",
@@ -374,6 +368,8 @@ class Entry(About):
         seeds = self.seeds
         if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
             raise ValueError("predictions: several need seeds that differ")
+        if self.kind is Kind.NAIVE:
+            raise ValueError("kind: learned, hybrid, calibrated or classical")
         predicted = [prediction.sha256 for prediction in self.predictions]
         scored = [file.predictions_sha256 for file in self.score.files]
         if predicted != scored:
@@ -401,9 +397,24 @@ class Entry(About):
         return score_paths(self.place, self.seeds)
 
     @property
-    def has_models(self) -> bool:
-        """Whether a model of any seed lies on the board."""
-        return any(prediction.weights is not None for prediction in self.predictions)
+    def flags(self) -> tuple[str, ...]:
+        """Names of the flags that the scorer raised for any seed."""
+        names = (flag.name for file in self.score.files for flag in file.flags)
+        return tuple(dict.fromkeys(names))
+
+    @property
+    def score_hashes(self) -> tuple[str, ...]:
+        """Hashes of the score files."""
+        return tuple(file.sha256 for file in self.score.files)
+
+    @property
+    def models(self) -> set[tuple[int | None, str]]:
+        """Seed and hash of the models that lie on the board."""
+        return {
+            (prediction.seed, prediction.weights.sha256)
+            for prediction in self.predictions
+            if prediction.weights is not None
+        }
 
 
 KEY_ORDER = (
@@ -466,7 +477,7 @@ def read_meta(path: Path | None, method: str | None = None) -> Meta:
     try:
         return validate(Meta, content, path or "--method")
     except ChecksFailedError as error:
-        raise UsageError(error.what) from None
+        raise UsageError(error.text) from None
 
 
 def entry_bytes(entry: Entry) -> bytes:

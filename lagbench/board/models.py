@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.registry import Registry
+from lagbench.data.local import load_rooted_registry, resolve_root
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import LagbenchError, UsageError, check_installed, suggest_name
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
 from lagbench.models.onnx_model import open_onnx
 from lagbench.scoring.task import SUBMISSION, ScoredTask, measure_rows
+from lagbench.work.run import Meter, Progress
 
 from .entry import Entry, Prediction, Status, find_model, is_current, read_entry
 from .folder import Folder
@@ -73,113 +76,145 @@ def choose_data_sets(
     return tuple(chosen)
 
 
-def choose_entries(
-    folder: Folder,
-    names: Sequence[str],
-    registry: Registry,
-    *,
-    split: str | None = None,
-    size: str | None = None,
-) -> list[Entry]:
-    """Return entries by name, or all active ones of the present data with models.
+@dataclass(frozen=True, kw_only=True)
+class ModelRuns:
+    """The models of a board's entries, and where and how they are run."""
 
-    Raises:
-        UsageError: no such entry, or one that has no model; or no entries of the split
-            or size.
-    """
-    known = {}
-    for path in folder.entries():
-        known["/".join(path.with_suffix("").parts[1:])] = path
-    chosen = []
-    for name in names:
-        if name not in known:
-            raise UsageError(
-                f"no entry {name!a} in {folder.path}; {suggest_name(name, known)}"
-            )
-        entry = read_entry(folder.path / known[name])
-        if not entry.has_models:
-            raise UsageError(
-                f"{name} has no model to run; its submitter may add one: lagbench "
-                "submit --weights FILE --replace"
-            )
-        chosen.append(entry)
-    if names:
+    folder: Folder
+    root: Path  # of all data sets
+    registry: Registry
+    threads: int
+    meter: Meter
+
+    @classmethod
+    def of(
+        cls,
+        board: str | Path,
+        *,
+        threads: int,
+        root: str | Path | None,
+        registry: Registry | None,
+        progress: Callable[[Progress], None] | None,
+    ) -> Self:
+        """Return the runs of a board.
+
+        Raises:
+            UsageError: no leaderboard.
+        """
+        folder = Folder(board)
+        folder.require()
+        data_root = resolve_root(root)
+        return cls(
+            folder=folder,
+            root=data_root,
+            registry=load_rooted_registry(data_root, registry),
+            threads=threads,
+            meter=Meter(progress),
+        )
+
+    def size(self, entry: Entry) -> Size:
+        """Return the data set of an entry."""
+        return self.registry.size(entry.split, entry.size)
+
+    def choose(
+        self, names: Sequence[str], *, split: str | None, size: str | None
+    ) -> list[Entry]:
+        """Return entries by name, or all active ones of the present data with models.
+
+        Raises:
+            UsageError: no such entry, or one that has no model; or no entries of the
+                split or size.
+        """
+        known = {}
+        for path in self.folder.entries():
+            known["/".join(path.with_suffix("").parts[1:])] = path
+        chosen = []
+        for name in names:
+            if name not in known:
+                raise UsageError(
+                    f"no entry {name!a} in {self.folder.path}; "
+                    f"{suggest_name(name, known)}"
+                )
+            entry = read_entry(self.folder.path / known[name])
+            if not entry.models:
+                raise UsageError(
+                    f"{name} has no model to run; its submitter may add one: lagbench "
+                    "submit --weights FILE --replace"
+                )
+            chosen.append(entry)
+        if names:
+            return chosen
+
+        data_sets = choose_data_sets(
+            self.folder.data_sets(), split, size, board=self.folder.path
+        )
+        for path in known.values():
+            if path.parts[1:3] not in data_sets:
+                continue
+            entry = read_entry(self.folder.path / path)
+            present = is_current(entry.dataset, self.size(entry))
+            if entry.status is Status.ACTIVE and entry.models and present:
+                chosen.append(entry)
         return chosen
 
-    data_sets = choose_data_sets(folder.data_sets(), split, size, board=folder.path)
-    for path in known.values():
-        if path.parts[1:3] not in data_sets:
-            continue
-        entry = read_entry(folder.path / path)
-        present = is_current(entry.dataset, registry.size(entry.split, entry.size))
-        if entry.status is Status.ACTIVE and entry.has_models and present:
-            chosen.append(entry)
-    return chosen
+    def open(self, entry: Entry, prediction: Prediction) -> Runner:
+        """Return the model of a seed, ready to predict.
 
+        Raises:
+            UsageError: the seed has no model, or torch is not installed.
+            ChecksFailedError: the file is not the one that the entry names.
+            UnreadableFileError: the file is damaged.
+            DataError: it was trained on other data.
+        """
+        if prediction.weights is None:
+            raise UsageError(f"{name_seed(entry, prediction)} has no model")
+        path = find_model(self.folder, prediction.weights)
+        if path.suffix == ".onnx":
+            return open_onnx(path, size=self.size(entry), root=self.root)
 
-def open_model(
-    folder: Folder,
-    entry: Entry,
-    prediction: Prediction,
-    *,
-    root: Path,
-    registry: Registry,
-    threads: int = 1,
-) -> Runner:
-    """Return the model of a seed, ready to predict.
+        check_installed("torch", extra="baselines")
+        from lagbench.baselines.runner import WeightsRunner
 
-    Raises:
-        UsageError: the seed has no model, or torch is not installed.
-        ChecksFailedError: the file is not the one that the entry names.
-        UnreadableFileError: the file is damaged.
-        DataError: it was trained on other data.
-    """
-    if prediction.weights is None:
-        raise UsageError(f"{name_seed(entry, prediction)} has no model")
-    path = find_model(folder, prediction.weights)
-    if path.suffix == ".onnx":
-        return open_onnx(path, size=registry.size(entry.split, entry.size), root=root)
+        return WeightsRunner(
+            path,
+            size=entry.size,
+            root=self.root,
+            registry=self.registry,
+            settings=prediction.settings,
+            threads=self.threads,
+        )
 
-    check_installed("torch", extra="baselines")
-    from lagbench.baselines.runner import WeightsRunner
+    def tallies(
+        self,
+        entry: Entry,
+        prediction: Prediction,
+        task: ScoredTask,
+        scenarios: Sequence[int],
+    ) -> dict[int, Tally]:
+        """Return the statistics of scenarios that the model of a seed predicts.
 
-    return WeightsRunner(
-        path,
-        size=entry.size,
-        root=root,
-        registry=registry,
-        settings=prediction.settings,
-        threads=threads,
-    )
-
-
-def predict_tallies(
-    model: Runner,
-    task: ScoredTask,
-    metric: str,
-    scenarios: Sequence[int],
-    *,
-    done: Callable[[], None],
-) -> dict[int, Tally]:
-    """Return the statistics that a metric needs, of scenarios that a model predicts.
-
-    Args:
-        model: the model.
-        task: the data set.
-        metric: name of the metric.
-        scenarios: ids of the scenarios.
-        done: called after every scenario.
-    """
-    tallies = {}
-    for scenario in scenarios:
-        position = model.predict(task.truth.path(scenario))
-        tallies[scenario] = score_positions(task, scenario, position, metric)
-        done()
-    return tallies
+        They are those that the entry's ranking metric needs.
+        """
+        count = len(scenarios)
+        with closing(self.open(entry, prediction)) as model:
+            self.meter.begin(name_seed(entry, prediction), total=count, scenarios=count)
+            tallies = {}
+            for scenario in scenarios:
+                tallies[scenario] = score_positions(
+                    task,
+                    scenario,
+                    model.predict(task.truth.path(scenario)),
+                    entry.score.ranking_metric,
+                )
+                self.meter.count(1, scenarios=1)
+        return tallies
 
 
 def score_positions(
-    task: ScoredTask, scenario: int, position: NDArray[np.float32], metric: str
+    task: ScoredTask,
+    scenario: int,
+    position: Iterable[NDArray[np.float32]],
+    metric: str,
 ) -> Tally:
     """Return the statistics of a predicted scenario that a metric needs."""
     with task.opened(scenario) as truth:

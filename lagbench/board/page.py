@@ -28,7 +28,7 @@ from .columns import SHOWN_METRICS, best_of, columns_of, format_number
 from .design import DesignRow, conclude_design, read_design
 from .entry import schema_bytes
 from .folder import PAGE, SCHEMA, Folder
-from .rows import Board, Row, Tab, conclude
+from .rows import Board, Tab, conclude
 
 Spec = dict[str, Any]
 
@@ -124,15 +124,12 @@ def build(
         raise ChecksFailedError(f"{names}: out of date; lagbench leaderboard build")
     for path in stale:
         write_atomically(path, files[path], option="--board")
-    page = folder.path / PAGE
-    entries = 0
-    for tab in content.tabs:
-        entries += sum(row.entry is not None for row in tab.rows)
+    rows = [row for tab in content.tabs for row in tab.rows]
     return BuildResult(
-        page=page,
-        bytes=page.stat().st_size,
+        page=folder.path / PAGE,
+        bytes=(folder.path / PAGE).stat().st_size,
         tabs=len(content.tabs),
-        rows=entries,
+        rows=sum(row.entry is not None for row in rows),
         written=tuple(stale),
     )
 
@@ -160,7 +157,21 @@ def render(
         curves = curve_chart(tab)
         if curves is not None:
             charts[f"curves-{tab.id}"] = with_config(curves)
-        tables.append(_table_of(tab))
+
+        columns = columns_of(tab.rows)
+        best = {column.key: best_of(column, tab.rows) for column in columns}
+        lines = []
+        for row in tab.rows:
+            cells = []
+            for column in columns:
+                cell = column.read(row)
+                order = "" if math.isnan(cell.order) else repr(cell.order)
+                cells.append((column, cell, order, row.id in best[column.key]))
+            lines.append((row, cells))
+        groups = list(dict.fromkeys(one.group for one in columns if one.group))
+        tables.append(
+            {"tab": tab, "columns": columns, "lines": lines, "groups": groups}
+        )
     for family in FAMILIES:
         design_rows = [row for row in design if row.family == family]
         if design_rows:
@@ -189,22 +200,6 @@ def render(
     )
 
 
-def _table_of(tab: Tab) -> dict[str, Any]:
-    """Return what the template needs of the table of a tab."""
-    columns = columns_of(tab.rows)
-    best = {column.key: best_of(column, tab.rows) for column in columns}
-    lines = []
-    for row in tab.rows:
-        cells = []
-        for column in columns:
-            cell = column.read(row)
-            order = "" if math.isnan(cell.order) else repr(cell.order)
-            cells.append((column, cell, order, row.id in best[column.key]))
-        lines.append((row, cells))
-    groups = dict.fromkeys(column.group for column in columns if column.group)
-    return {"tab": tab, "columns": columns, "lines": lines, "groups": list(groups)}
-
-
 def describe_goal(tab: Tab) -> str:
     """Return the corners of the classical side: a network pays below one of them."""
     corners = []
@@ -223,7 +218,10 @@ def cost_chart(tab: Tab, *, is_large: bool) -> Spec:
         tab: the data set.
         is_large: whether axes have titles, and rows their names.
     """
-    rows = [row for row in tab.rows if _has_place(row)]
+    rows = []
+    for row in tab.rows:
+        if row.seconds and 0.0 < row.score.mean < math.inf:  # axes are logarithmic
+            rows.append(row)
     entries = [row.id for row in rows if row.entry is not None]
     named = {corner.name for corner in tab.hull} | set(entries[:NAMED_ENTRIES])
     points: list[dict[str, Any]] = []
@@ -259,9 +257,17 @@ def cost_chart(tab: Tab, *, is_large: bool) -> Spec:
             }
         )
     if tab.hull:
+        # upright above its first corner, level beyond its last
+        corners = [(1e3 * row.seconds, row.error) for row in tab.hull]
+        corners.insert(0, (corners[0][0], 2.0 * max(errors)))
+        corners.append((100.0 * max(costs), corners[-1][1]))
+        line = [
+            {"ms": milliseconds, "error": error, "order": order}
+            for order, (milliseconds, error) in enumerate(corners)
+        ]
         layers.append(
             {
-                "data": {"values": _hull_line(tab, costs, errors)},
+                "data": {"values": line},
                 "mark": {"type": "line", "color": COLOURS["classical"], "clip": True},
                 "encoding": {"x": x, "y": y, "order": {"field": "order"}},
             }
@@ -292,11 +298,6 @@ def cost_chart(tab: Tab, *, is_large: bool) -> Spec:
     return chart | SMALL | {"title": tab.name}
 
 
-def _has_place(row: Row) -> bool:
-    """Tell whether a row has a place on logarithmic axes."""
-    return bool(row.seconds) and 0.0 < row.score.mean < math.inf
-
-
 def _log_axis(name: str, values: Sequence[float], *, ticks: int, room: float) -> Spec:
     """Return the encoding of a logarithmic axis with some room beyond the values."""
     domain = [0.1, 1.0]
@@ -309,22 +310,6 @@ def _log_axis(name: str, values: Sequence[float], *, ticks: int, room: float) ->
         "scale": {"type": "log", "domain": domain, "nice": False},
         "axis": {"tickCount": ticks, "format": "~g"},
     }
-
-
-def _hull_line(
-    tab: Tab, costs: Sequence[float], errors: Sequence[float]
-) -> list[dict[str, float]]:
-    """Return the hull: upright above its first corner, level beyond its last."""
-    corners = [(1e3 * row.seconds, row.error) for row in tab.hull]
-    line = [
-        (corners[0][0], 2.0 * max(errors)),
-        *corners,
-        (100.0 * max(costs), corners[-1][1]),
-    ]
-    points = []
-    for order, (milliseconds, error) in enumerate(line):
-        points.append({"ms": milliseconds, "error": error, "order": order})
-    return points
 
 
 def curve_chart(tab: Tab) -> Spec | None:

@@ -35,7 +35,6 @@ class CombinedScore:
     score: Score  # mean over seeds, per frame and per scenario
     # sample standard deviation over seeds of the mean over scenarios; NaN for one seed
     std: float
-    means: tuple[float, ...]  # mean over scenarios of each seed
     seeds: tuple[Score, ...]  # of each seed, in the order of the files
 
     @property
@@ -54,9 +53,9 @@ def combine(
     that are formed only when they are named. With names, these metrics alone are
     formed.
     """
-    statistics = set(_statistics_of(seeds[0]))
-    for tallies in seeds[1:]:
-        statistics.intersection_update(_statistics_of(tallies))
+    statistics = set.intersection(
+        *(set(next(iter(tallies.values())).names) for tallies in seeds)
+    )
     metrics = []
     for metric in METRICS.values():
         if names is None:
@@ -71,16 +70,14 @@ def combine(
     for metric in metrics:
         name = metric.name
         if all(name in seed_scores for seed_scores in scores):
-            combined[name] = _combine([seed_scores[name] for seed_scores in scores])
+            combined[name] = combine_seeds(
+                [seed_scores[name] for seed_scores in scores]
+            )
     return combined
 
 
-def _statistics_of(tallies: Mapping[int, Tally]) -> Sequence[str]:
-    first_tally = next(iter(tallies.values()))
-    return first_tally.names
-
-
-def _combine(seeds: Sequence[Score]) -> CombinedScore:
+def combine_seeds(seeds: Sequence[Score]) -> CombinedScore:
+    """Return the score of a method from those of its seeds, in one metric."""
     score = seeds[0]
     if len(seeds) > 1:
         undefined = np.sum([seed.undefined for seed in seeds], axis=0)
@@ -91,12 +88,9 @@ def _combine(seeds: Sequence[Score]) -> CombinedScore:
             undefined=tuple(undefined.tolist()),
         )
 
-    means = tuple(seed.mean for seed in seeds)
-    defined_means = [value for value in means if not math.isnan(value)]
-    std = math.nan
-    if len(defined_means) > 1:
-        std = float(np.std(defined_means, ddof=1))
-    return CombinedScore(score=score, std=std, means=means, seeds=tuple(seeds))
+    means = [seed.mean for seed in seeds if not math.isnan(seed.mean)]
+    std = float(np.std(means, ddof=1)) if len(means) > 1 else math.nan
+    return CombinedScore(score=score, std=std, seeds=tuple(seeds))
 
 
 def summarise(scores: Mapping[str, CombinedScore]) -> dict[str, Summary]:
@@ -115,14 +109,18 @@ def summarise(scores: Mapping[str, CombinedScore]) -> dict[str, Summary]:
 
 def scored_file(card: ScoreCard, path: Path) -> ScoredFile:
     """Return the description of a card's score file in an entry."""
-    flags = []
-    for flag in card.flags:
-        if flag.raised:
-            flags.append(_entry_flag(flag.name, flag.reasons))
+
+    def as_flag(
+        name: str, reasons: Sequence[str], share: float | None = None
+    ) -> EntryFlag:
+        texts = tuple(reason[:LONGEST_TEXT] for reason in reasons)
+        return EntryFlag(name=name, reasons=texts, share=share)
+
+    flags = [as_flag(one.name, one.reasons) for one in card.flags if one.raised]
     warnings = []
     for issue in card.warnings:
         reason = f"{issue.where}: {issue.what}"
-        warnings.append(_entry_flag(issue.check, [reason], share=issue.share))
+        warnings.append(as_flag(issue.check, [reason], issue.share))
     return ScoredFile(
         sha256=file_sha256(path),
         predictions_sha256=card.predictions_sha256,
@@ -130,10 +128,3 @@ def scored_file(card: ScoreCard, path: Path) -> ScoredFile:
         flags=tuple(flags),
         warnings=tuple(warnings),
     )
-
-
-def _entry_flag(
-    name: str, reasons: Sequence[str], *, share: float | None = None
-) -> EntryFlag:
-    short_reasons = tuple(reason[:LONGEST_TEXT] for reason in reasons)
-    return EntryFlag(name=name, reasons=short_reasons, share=share)

@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data.checksums import round_digits
-from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, LagbenchError, WorkFailedError
 from lagbench.metrics.aggregate import Tally, score
@@ -36,16 +35,8 @@ from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.machine import available_cores, processor_name
 from lagbench.work.run import Meter, Progress
 
-from .entry import Entry, Prediction, today
-from .folder import Folder
-from .models import (
-    Failure,
-    Runner,
-    choose_entries,
-    name_seed,
-    open_model,
-    predict_tallies,
-)
+from .entry import Entry, today
+from .models import Failure, ModelRuns, Runner, name_seed
 from .verified import (
     Level,
     MeasuredCost,
@@ -175,22 +166,18 @@ def reproduce(
         WorkFailedError: the machine is too busy to record costs, or the disk or the
             memory is full.
     """
-    folder = Folder(board)
-    folder.require()
-    data_root = resolve_root(root)
+    runs = ModelRuns.of(
+        board, threads=threads, root=root, registry=registry, progress=progress
+    )
     run = _Run(
-        folder=folder,
-        root=data_root,
-        registry=load_rooted_registry(data_root, registry),
+        runs=runs,
         scenarios=scenarios,
         again=again,
         recording=recording,
-        threads=threads,
-        meter=Meter(progress),
-        result=ReproduceResult(folder=folder.path),
+        result=ReproduceResult(folder=runs.folder.path),
         raises=bool(entries),
     )
-    chosen = choose_entries(folder, entries, run.registry, split=split, size=size)
+    chosen = runs.choose(entries, split=split, size=size)
     if scores:
         for entry in chosen:
             try:
@@ -210,14 +197,10 @@ def reproduce(
 class _Run:
     """One run of the command: its choices, and what it has loaded."""
 
-    folder: Folder
-    root: Path
-    registry: Registry
+    runs: ModelRuns
     scenarios: int | None
     again: bool
     recording: bool
-    threads: int
-    meter: Meter
     result: ReproduceResult
     raises: bool  # whether errors of an entry end the run
     _tasks: dict[tuple[str, str], ScoredTask] = field(default_factory=dict)
@@ -228,7 +211,7 @@ class _Run:
         """Return the record of an entry: of this run, else the written one."""
         line = self._lines.get(entry.yaml_path.as_posix())
         if line is None:
-            line = verification_of(entry, read_verified(self.folder))
+            line = verification_of(entry, read_verified(self.runs.folder))
         return line
 
     def keep(self, entry: Entry, error: LagbenchError) -> None:
@@ -242,7 +225,7 @@ class _Run:
     def _task(self, entry: Entry) -> ScoredTask:
         key = (entry.split, entry.size)
         if key not in self._tasks:
-            self._tasks[key] = load_scored_task(self.registry.size(*key), self.root)
+            self._tasks[key] = load_scored_task(self.runs.size(entry), self.runs.root)
         return self._tasks[key]
 
     def _change(
@@ -250,14 +233,17 @@ class _Run:
     ) -> None:
         """Change the record of an entry; without recording only in memory."""
         if self.recording:
-            record(self.folder, entry, change)
+            record(self.runs.folder, entry, change)
         else:
             line = self.line_of(entry) or empty_record(entry)
             self._lines[entry.yaml_path.as_posix()] = change(line)
 
     def reproduce(self, entry: Entry) -> None:
         """Predict with every model of an entry, and record how the scores compare."""
-        for index, prediction in enumerate(entry.predictions):
+        models = [one for one in entry.predictions if one.weights is not None]
+        for prediction, score_path in zip(
+            entry.predictions, entry.score_paths, strict=True
+        ):
             if prediction.weights is None:
                 continue
             task = self._task(entry)
@@ -269,46 +255,22 @@ class _Run:
                 recorded = {one.seed: one.scenarios for one in line.reproduced}
                 if recorded.get(prediction.seed, 0) >= len(chosen):
                     continue
-            name = name_seed(entry, prediction)
-            stored = read_statistics(self.folder.path / entry.score_paths[index])
-            model = self._open(entry, prediction)
-            self.meter.begin(name, total=len(chosen), scenarios=len(chosen))
-            try:
-                tallies = predict_tallies(
-                    model,
-                    task,
-                    entry.score.ranking_metric,
-                    chosen,
-                    done=lambda: self.meter.count(1, scenarios=1),
-                )
-            finally:
-                model.close()
+            stored = read_statistics(self.runs.folder.path / score_path)
             reproduction = compare(
                 entry.score.ranking_metric,
                 {scenario: stored.tallies[scenario] for scenario in chosen},
-                tallies,
+                self.runs.tallies(entry, prediction, task, chosen),
                 seed=prediction.seed,
                 model=prediction.weights.sha256,
                 of=len(task.scenarios),
             )
-            models = [one for one in entry.predictions if one.weights is not None]
             self._change(
                 entry,
                 partial(
                     with_reproduction, reproduction=reproduction, models=len(models)
                 ),
             )
-            self.result.predicted.append(name)
-
-    def _open(self, entry: Entry, prediction: Prediction) -> Runner:
-        return open_model(
-            self.folder,
-            entry,
-            prediction,
-            root=self.root,
-            registry=self.registry,
-            threads=self.threads,
-        )
+            self.result.predicted.append(name_seed(entry, prediction))
 
     def measure(self, entries: Sequence[Entry], time_solver: TimeSolver | None) -> None:
         """Measure what a frame costs the models of entries, by data set."""
@@ -325,7 +287,7 @@ class _Run:
                 for entry in group:
                     first = next(one for one in entry.predictions if one.weights)
                     try:
-                        runner = self._open(entry, first)
+                        runner = self.runs.open(entry, first)
                     except LagbenchError as error:
                         self.keep(entry, error)
                         continue
@@ -337,22 +299,18 @@ class _Run:
                     costs = measure_costs(
                         runners,
                         self._task(group[0]),
-                        root=self.root,
+                        root=self.runs.root,
                         time_solver=time_solver,
-                        meter=self.meter,
+                        meter=self.runs.meter,
                     )
                 except LagbenchError as error:
                     self.keep(group[0], error)
                     continue
             for entry in group:
-                cost = costs.get(entry.method)
-                if cost is not None:
-                    self._change(entry, partial(_with_cost, cost=cost))
+                if entry.method in costs:
+                    update = {"cost": costs[entry.method]}
+                    self._change(entry, partial(Verification.model_copy, update=update))
                     self.result.measured.append("/".join(entry.place))
-
-
-def _with_cost(line: Verification, cost: MeasuredCost) -> Verification:
-    return line.model_copy(update={"cost": cost})
 
 
 def sample_scenarios(

@@ -90,9 +90,7 @@ class Row:
     seconds: float | None
     # 1 - score / score of the best naive baseline
     skill: Value | None
-    # ranking metric and skill on the subset shift, which lies outside train
-    shift_score: float | None
-    shift_skill: Value | None
+    shift_skill: Value | None  # skill on the subset shift, which lies outside train
     failed_gates: tuple[str, ...] = ()  # of its weights; such a row is under-trained
     speedup: Speedup | None = None
     why_no_speedup: NoSpeedup | None = None
@@ -110,12 +108,7 @@ class Row:
     @property
     def flags(self) -> tuple[str, ...]:
         """Names of the flags that the scorer raised for any seed."""
-        if self.entry is None:
-            return ()
-        names: dict[str, None] = {}
-        for file in self.entry.score.files:
-            names.update(dict.fromkeys(flag.name for flag in file.flags))
-        return tuple(names)
+        return () if self.entry is None else self.entry.flags
 
     @property
     def diverged(self) -> int:
@@ -155,7 +148,16 @@ class Tab:
     @property
     def front_rows(self) -> list[FrontRow]:
         """The rows as the front takes them."""
-        return [_front_row(row, self.scenarios) for row in self.rows]
+        return [
+            front_row(
+                name=row.id,
+                kind=row.kind,
+                seconds=row.seconds,
+                seeds=row.seeds,
+                scenarios=self.scenarios,
+            )
+            for row in self.rows
+        ]
 
     @property
     def hull(self) -> list[FrontRow]:
@@ -246,13 +248,3 @@ def _state_result(judged: list[Tab], board: Board) -> Iterator[str]:
             "or calibrated solver is as accurate as the best network in the same time "
             "or less, or the difference is within the 95 % interval."
         )
-
-
-def _front_row(row: Row, scenarios: Sequence[int]) -> FrontRow:
-    return front_row(
-        name=row.id,
-        kind=row.kind,
-        seconds=row.seconds,
-        seeds=row.seeds,
-        scenarios=scenarios,
-    )

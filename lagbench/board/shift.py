@@ -46,6 +46,10 @@ class ShiftScores(Strict):
         tuple[ShiftModel, ...], Field(min_length=1, max_length=100, strict=False)
     ]
 
+    def is_of(self, entry: Entry) -> bool:
+        """Return whether the models are those of an entry."""
+        return entry.models.issuperset((one.seed, one.model) for one in self.models)
+
 
 class ShiftFile(RootModel[dict[str, ShiftScores]]):
     """Entries by path, relative to the leaderboard's folder."""
@@ -59,9 +63,8 @@ def read_shift(folder: Folder) -> dict[str, ShiftScores]:
         ChecksFailedError: it holds something else.
     """
     path = folder.path / SHIFT
-    if not path.exists():
-        return {}
-    return validate(ShiftFile, read_yaml(path) or {}, path).root
+    content = read_yaml(path) if path.exists() else None
+    return validate(ShiftFile, content or {}, path).root
 
 
 def shift_of(
@@ -78,30 +81,14 @@ def shift_of(
         )
         if (scores.dataset_sha256, scores.subset_sha256) != recorded:
             return None
-    if not _models_of(entry).issuperset(_models_in(scores)):
-        return None
-    return scores
-
-
-def _models_of(entry: Entry) -> set[tuple[int | None, str]]:
-    """Return seed and hash of the models of an entry."""
-    models = set()
-    for prediction in entry.predictions:
-        if prediction.weights is not None:
-            models.add((prediction.seed, prediction.weights.sha256))
-    return models
-
-
-def _models_in(scores: ShiftScores) -> set[tuple[int | None, str]]:
-    return {(model.seed, model.model) for model in scores.models}
+    return scores if scores.is_of(entry) else None
 
 
 def scores_of_seeds(scores: ShiftScores) -> list[Score]:
     """Return the score of each seed, without values per frame."""
     seeds = []
     for model in scores.models:
-        scenarios = tuple(sorted(model.values))
-        values = [model.values[scenario] for scenario in scenarios]
+        scenarios, values = zip(*sorted(model.values.items()), strict=True)
         seeds.append(
             Score(
                 metric=METRICS[scores.metric],
@@ -139,7 +126,7 @@ def remove_stale_scores(folder: Folder, entry: Entry) -> bool:
     """Remove the scores of other models of an entry; return whether there were."""
     shift = read_shift(folder)
     scores = shift.get(entry.yaml_path.as_posix())
-    if scores is None or _models_of(entry).issuperset(_models_in(scores)):
+    if scores is None or scores.is_of(entry):
         return False
     del shift[entry.yaml_path.as_posix()]
     _write(folder, shift)

@@ -13,17 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data.checksums import round_digits
-from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.task import load_scored_task
-from lagbench.work.run import Meter, Progress
+from lagbench.work.run import Progress
 
-from .folder import Folder
-from .models import Failure, choose_entries, name_seed, open_model, predict_tallies
+from .models import Failure, ModelRuns, name_seed
 from .shift import SUBSET, ShiftModel, ShiftScores, read_shift, record_shift, shift_of
 
 DIGITS = 9
@@ -91,25 +89,19 @@ def score_on_shift(
             nothing to run.
         LagbenchError: a named entry cannot be run; of all entries the others are run.
     """
-    folder = Folder(board)
-    folder.require()
-    data_root = resolve_root(root)
-    rooted = load_rooted_registry(data_root, registry)
-    meter = Meter(progress)
+    runs = ModelRuns.of(
+        board, threads=threads, root=root, registry=registry, progress=progress
+    )
+    folder = runs.folder
     result = ShiftResult(folder=folder.path)
-    chosen = choose_entries(folder, entries, rooted, split=split, size=size)
+    chosen = runs.choose(entries, split=split, size=size)
     if not entries:
-        chosen = [
-            entry
-            for entry in chosen
-            if SUBSET in rooted.size(entry.split, entry.size).subsets
-        ]
+        chosen = [entry for entry in chosen if SUBSET in runs.size(entry).subsets]
     if not chosen:
         raise UsageError("no entry to score on shift; `lagbench list` shows subsets")
 
     for entry in chosen:
-        path = entry.yaml_path.as_posix()
-        tier = rooted.size(entry.split, entry.size)
+        tier = runs.size(entry)
         try:
             for prediction in entry.predictions:
                 if prediction.weights is None:
@@ -118,46 +110,23 @@ def score_on_shift(
                 seeds = () if present is None else [one.seed for one in present.models]
                 if prediction.seed in seeds and not again:
                     continue
-                manifest = read_manifest(data_root, tier.split, tier.name, tier.major)
+                manifest = read_manifest(runs.root, tier.split, tier.name, tier.major)
                 if manifest is None or SUBSET not in manifest.subset_sha256:
                     raise DataError(
                         f"no manifest with the hash of {SUBSET}; lagbench verify "
                         f"--split {tier.split} --size {tier.name}"
                     )
-                task = load_scored_task(tier.scored_on(SUBSET), data_root)
-                model = open_model(
-                    folder,
-                    entry,
-                    prediction,
-                    root=data_root,
-                    registry=rooted,
-                    threads=threads,
-                )
-                name = name_seed(entry, prediction)
-                count = len(task.scenarios)
-                meter.begin(name, total=count, scenarios=count)
-                try:
-                    tallies = predict_tallies(
-                        model,
-                        task,
-                        entry.score.ranking_metric,
-                        task.scenarios,
-                        done=lambda: meter.count(1, scenarios=1),
-                    )
-                finally:
-                    model.close()
+                task = load_scored_task(tier.scored_on(SUBSET), runs.root)
+                tallies = runs.tallies(entry, prediction, task, task.scenarios)
                 scores = score(METRICS[entry.score.ranking_metric], tallies)
+                name = name_seed(entry, prediction)
                 if scores is None or not np.isfinite(scores.values).all():
                     raise ChecksFailedError(f"{name}: no finite score on {SUBSET}")
-                values = {}
-                for scenario, value in zip(
-                    scores.scenarios, scores.values.tolist(), strict=True
-                ):
-                    values[scenario] = round_digits(value, DIGITS)
+                values = [round_digits(one, DIGITS) for one in scores.values.tolist()]
                 written = ShiftModel(
                     seed=prediction.seed,
                     model=prediction.weights.sha256,
-                    values=values,
+                    values=dict(zip(scores.scenarios, values, strict=True)),
                 )
                 subset_sha256 = manifest.subset_sha256[SUBSET]
                 record_shift(folder, entry, tier, written, subset_sha256)
@@ -168,5 +137,5 @@ def score_on_shift(
             result.failures.append(Failure(entry="/".join(entry.place), error=error))
         present = shift_of(entry, tier, read_shift(folder))
         if present is not None:
-            result.entries[path] = present
+            result.entries[entry.yaml_path.as_posix()] = present
     return result

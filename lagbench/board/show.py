@@ -12,7 +12,7 @@ from lagbench.metrics.table import METRICS
 from lagbench.scoring.front import digits
 
 from .columns import MAIN_COLUMNS, columns_of, describe_check, format_number
-from .rows import Board, Row, Tab, Value, conclude
+from .rows import Board, Row, Value, conclude
 
 SHOWN = ("rank", "method", "score", "skill", "milliseconds", "speedup", "breakeven")
 """Columns of a table in the terminal."""
@@ -33,10 +33,7 @@ def tables(board: Board, metrics: Collection[str] = ()) -> Iterator[Table]:
             raise UsageError(f"no metric {name!a}; {suggest_name(name, METRICS)}")
     for tab in board.tabs:
         shown = {column.key for column in columns_of(tab.rows)}
-        columns = []
-        for column in MAIN_COLUMNS:
-            if column.key in SHOWN and column.key in shown:
-                columns.append(column)
+        columns = [one for one in MAIN_COLUMNS if one.key in shown.intersection(SHOWN)]
         rows = []
         for row in tab.rows:
             cells = [column.read(row).text for column in columns]
@@ -64,36 +61,35 @@ def _remarks(row: Row) -> str:
 
 def to_plain(board: Board) -> dict[str, Any]:
     """Return a board as values for JSON; undefined numbers are None."""
-    return {
-        "conclusion": conclude(board),
-        "tabs": [_plain_tab(tab) for tab in board.tabs],
-    }
-
-
-def _plain_tab(tab: Tab) -> dict[str, Any]:
-    hull = []
-    for corner in tab.hull:
-        hull.append(
+    tabs = []
+    for tab in board.tabs:
+        hull = []
+        for corner in tab.hull:
+            hull.append(
+                {
+                    "id": corner.name,
+                    "error": digits(corner.error),
+                    "seconds_per_frame": corner.seconds,
+                }
+            )
+        tabs.append(
             {
-                "id": corner.name,
-                "error": digits(corner.error),
-                "seconds_per_frame": corner.seconds,
+                "split": tab.size.split,
+                "size": tab.size.name,
+                "dataset_version": tab.size.version,
+                "ranking_metric": tab.ranking,
+                "truth_error": tab.truth_error,
+                "hull": hull,
+                "rows": [_plain_row(row) for row in tab.rows if row.entry is not None],
+                "references": [
+                    _plain_row(row) for row in tab.rows if row.entry is None
+                ],
             }
         )
-    return {
-        "split": tab.size.split,
-        "size": tab.size.name,
-        "dataset_version": tab.size.version,
-        "ranking_metric": tab.ranking,
-        "truth_error": tab.truth_error,
-        "hull": hull,
-        "rows": [_plain_row(row) for row in tab.rows if row.entry is not None],
-        "references": [_plain_row(row) for row in tab.rows if row.entry is None],
-    }
+    return {"conclusion": conclude(board), "tabs": tabs}
 
 
 def _plain_row(row: Row) -> dict[str, Any]:
-    metrics = {name: _plain_value(value) for name, value in row.metrics.items()}
     speedup = None
     if row.speedup is not None:
         low, high = row.speedup.interval
@@ -119,7 +115,7 @@ def _plain_row(row: Row) -> dict[str, Any]:
         "speedup": speedup,
         "why_no_speedup": row.why_no_speedup and str(row.why_no_speedup),
         "breakeven": after,
-        "metrics": metrics,
+        "metrics": {name: _plain_value(one) for name, one in row.metrics.items()},
     }
     if row.entry is not None:
         budget = row.entry.budget
@@ -139,8 +135,5 @@ def _plain_value(value: Value | None) -> dict[str, float | None] | None:
     if value is None:
         return None
     return {
-        "mean": digits(value.mean),
-        "std": digits(value.std),
-        "low": digits(value.low),
-        "high": digits(value.high),
+        name: digits(getattr(value, name)) for name in ("mean", "std", "low", "high")
     }

@@ -11,9 +11,9 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -94,7 +94,6 @@ class PredictionsFile:
     header: Header
     sha256: str  # content hash
     validation: ValidationResult
-    weights: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +165,7 @@ def submit(
     else:
         folder.require()
 
-    full_registry = registry or load()
+    known = registry or load()
     files = []
     for path in map(Path, predictions):
         check_file(path, fix=WRITE)
@@ -176,16 +175,60 @@ def submit(
         if examined is not None:
             examined(validation)
         validation.check()
-        files.append(_read_predictions(path, validation, full_registry))
-    _require_seeds_of_one_method([file.header for file in files])
-    files = _with_weights(files, [Path(path) for path in weights])
-    place = _place_of(files[0].header, meta)
+        with open_predictions(path) as opened:
+            header = opened.header
+            sha256 = validation.sha256 or opened.content_sha256()
+        if header.split not in known.splits:
+            raise UsageError(
+                f"{path}: {header.split} is a split of your own; a leaderboard takes "
+                "those of lagbench, `lagbench score` takes yours too"
+            )
+        if header.subset != "test":
+            raise UsageError(
+                f"{path}: predictions of the subset {header.subset}; submit those of "
+                "test"
+            )
+        provenance = header.provenance
+        if provenance is not None and {"test", "shift"} & set(provenance.subsets):
+            raise UsageError(f"{path}: the model was trained on scored scenarios")
+        files.append(
+            PredictionsFile(
+                path=path, header=header, sha256=sha256, validation=validation
+            )
+        )
+    headers = [file.header for file in files]
+    for name in SHARED_LABELS:
+        labels = {str(getattr(header, name)) for header in headers}
+        if len(labels) > 1:
+            raise UsageError(
+                f"the files differ in {name}: {', '.join(sorted(map(ascii, labels)))}; "
+                "submit each method on its own"
+            )
+    seeds = [header.seed for header in headers]
+    if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
+        raise UsageError(
+            f"several files need different seeds, got {seeds}; write them with "
+            "submission.write(..., seed=0), seed=1 and so on"
+        )
+    weights_by_seed = _pair_weights(headers, [Path(path) for path in weights])
+    method = meta.method or headers[0].method
+    if re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", method) is None or len(method) > 60:
+        suggestion = re.sub("[^a-z0-9]+", "-", method.lower()).strip("-")[:60]
+        raise UsageError(
+            f"{method!a} cannot name an entry; name it: --method "
+            f"{suggestion or 'my-model'}"
+        )
+    if method in REFERENCES:
+        raise UsageError(
+            f"{method} is the name of a reference predictor; name another: --method"
+        )
+    place = headers[0].split, headers[0].size, method
     if (folder.path / entry_path(place)).exists() and not replace:
         raise UsageError(
             f"the leaderboard has an entry {'/'.join(place)}; --replace replaces it, "
             "or name another --method"
         )
-    about = _describe([file.header for file in files], meta)
+    about = _describe(headers, meta)
 
     cards = []
     for file in files:
@@ -202,7 +245,9 @@ def submit(
         cards.append(card)
     try:
         with folder.lock():
-            return _publish(folder, place, about, meta, files, cards)
+            return _publish(
+                folder, place, about, meta.urls, files, cards, weights_by_seed
+            )
     except OSError as error:
         raise WorkFailedError(
             f"cannot write {error.filename or folder.path}: {error.strerror}; free "
@@ -210,94 +255,30 @@ def submit(
         ) from error
 
 
-def _read_predictions(
-    path: Path, validation: ValidationResult, registry: Registry
-) -> PredictionsFile:
-    with open_predictions(path) as opened:
-        header = opened.header
-        if header.split not in registry.splits:
-            raise UsageError(
-                f"{path}: {header.split} is a split of your own; a leaderboard takes "
-                "those of lagbench, `lagbench score` takes yours too"
-            )
-        if header.subset != "test":
-            raise UsageError(
-                f"{path}: predictions of the subset {header.subset}; submit those of "
-                "test"
-            )
-        provenance = header.provenance
-        if provenance is not None and {"test", "shift"} & set(provenance.subsets):
-            raise UsageError(f"{path}: the model was trained on scored scenarios")
-        return PredictionsFile(
-            path=path,
-            header=header,
-            sha256=validation.sha256 or opened.content_sha256(),
-            validation=validation,
-        )
-
-
-def _require_seeds_of_one_method(headers: Sequence[Header]) -> None:
-    for name in SHARED_LABELS:
-        labels = {str(getattr(header, name)) for header in headers}
-        if len(labels) > 1:
-            raise UsageError(
-                f"the files differ in {name}: {', '.join(sorted(map(ascii, labels)))}; "
-                "submit each method on its own"
-            )
-    seeds = [header.seed for header in headers]
-    if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
-        raise UsageError(
-            f"several files need different seeds, got {seeds}; write them with "
-            "submission.write(..., seed=0), seed=1 and so on"
-        )
-
-
-def _with_weights(
-    files: Sequence[PredictionsFile], paths: Sequence[Path]
-) -> list[PredictionsFile]:
-    """Return the files with their weights: by seed, ONNX files in their order."""
-    if len(paths) > len(files):
+def _pair_weights(headers: Sequence[Header], paths: Sequence[Path]) -> dict[int, Path]:
+    """Return files of weights by the seed that they hold; ONNX files in their order."""
+    if len(paths) > len(headers):
         raise UsageError("more files of weights than predictions; give one per seed")
-    weights_of_seed: dict[int, Path] = {}
-    seeds = [file.header.seed or 0 for file in files]
-    for number, path in enumerate(paths):
-        header = files[0].header
+    weights = {}
+    seeds = [header.seed or 0 for header in headers]
+    for seed, path in zip(seeds, paths, strict=False):
+        split = headers[0].split
         if path.suffix == ".onnx":
-            split = check_onnx(path).split or header.split
-            seed = seeds[number]
+            found = check_onnx(path).split or split
         else:
             check_installed("torch", extra="baselines")
             from lagbench.baselines.checkpoint import load as load_weights
 
             checkpoint = load_weights(path)
-            split = checkpoint.info.split
+            found = checkpoint.info.split
             seed = checkpoint.seed
-        if split != header.split or seed not in seeds:
+        if found != split or seed not in seeds:
             raise UsageError(
-                f"{path} holds weights of {split}, seed {seed}; the predictions are of "
-                f"{header.split}, seeds {seeds}"
+                f"{path} holds weights of {found}, seed {seed}; the predictions are of "
+                f"{split}, seeds {seeds}"
             )
-        weights_of_seed[seed] = path
-    paired = []
-    for file, seed in zip(files, seeds, strict=True):
-        paired.append(replace(file, weights=weights_of_seed.get(seed)))
-    return paired
-
-
-def _place_of(header: Header, meta: Meta) -> Place:
-    """Return split, size and method; the label of predictions may name the method."""
-    method = meta.method or header.method
-    if re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", method) is None or len(method) > 60:
-        suggestion = re.sub("[^a-z0-9]+", "-", method.lower()).strip("-")[:60]
-        raise UsageError(
-            f"{method!a} cannot name an entry; name it: --method "
-            f"{suggestion or 'my-model'}"
-        )
-    if method in REFERENCES:
-        raise UsageError(
-            f"{method} is the name of a reference predictor; name another: --method"
-        )
-    return header.split, header.size, method
+        weights[seed] = path
+    return weights
 
 
 def _describe(headers: Sequence[Header], meta: Meta) -> About:
@@ -323,22 +304,28 @@ def _publish(
     folder: Folder,
     place: Place,
     about: About,
-    meta: Meta,
+    urls: Sequence[str | None],
     files: Sequence[PredictionsFile],
     cards: Sequence[ScoreCard],
+    weights: Mapping[int, Path],
 ) -> SubmitResult:
     """Write the entry with its files; remove files that it no longer has."""
     previous = None
     if (folder.path / entry_path(place)).exists():
         previous = read_entry(folder.path / entry_path(place))
     with tempfile.TemporaryDirectory(prefix=".submit-", dir=folder.path) as scratch:
-        staging = _Staging(folder, Path(scratch))
+        copies: dict[Path, Path] = {}  # files that are moved to their places
+
+        def stage(path: Path) -> Path:
+            copies[path] = Path(scratch) / f"{len(copies)}{path.suffix}"
+            return copies[path]
+
         predictions = []
         scored_files = []
         paths = score_paths(place, [file.header.seed for file in files])
-        urls = meta.urls or [None] * len(files)
+        urls = urls or [None] * len(files)
         for file, card, path, url in zip(files, cards, paths, urls, strict=True):
-            copy = staging.add(path)
+            copy = stage(path)
             write_statistics(card, copy, option="--board")
             if copy.stat().st_size > MAX_SCORE_BYTES:
                 raise WorkFailedError(
@@ -354,7 +341,13 @@ def _publish(
                     bytes=file.path.stat().st_size,
                     budget=file.header.budget,
                     provenance=file.header.provenance,
-                    weights=_stage_weights(folder, staging, place, file),
+                    weights=_stage_weights(
+                        folder,
+                        stage,
+                        weights.get(file.header.seed or 0),
+                        place,
+                        file.header.seed,
+                    ),
                 )
             )
         tallies = [card.tallies[SUBMISSION] for card in cards]
@@ -382,20 +375,20 @@ def _publish(
             },
             "the entry",
         )
-        staging.add(entry.yaml_path).write_bytes(entry_bytes(entry))
+        stage(entry.yaml_path).write_bytes(entry_bytes(entry))
         references = _write_references(cards[0], folder)
-        staging.move()
+        for path, copy in copies.items():
+            target = folder.path / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(copy, target)
 
-    written = [folder.path / path for path in staging.copies]
+    written = [folder.path / path for path in copies]
     if remove_stale_record(folder, entry):
         written.append(folder.path / VERIFIED)
     if remove_stale_scores(folder, entry):
         written.append(folder.path / SHIFT)
     removed = _remove_stale_files(folder, entry, previous)
     summary = entry.score.metrics[entry.score.ranking_metric]
-    flags: dict[str, None] = {}
-    for scored in entry.score.files:
-        flags.update(dict.fromkeys(flag.name for flag in scored.flags))
     return SubmitResult(
         split=split,
         size=size,
@@ -403,7 +396,7 @@ def _publish(
         ranking=entry.score.ranking_metric,
         mean=summary.mean,
         std=summary.std,
-        flags=tuple(flags),
+        flags=entry.flags,
         has_cost=entry.cost is not None,
         board=folder.path,
         # the entry first, although it is moved last
@@ -412,32 +405,14 @@ def _publish(
     )
 
 
-@dataclass(frozen=True)
-class _Staging:
-    """New files of the leaderboard that are not in their places yet."""
-
-    folder: Folder
-    scratch: Path
-    copies: dict[Path, Path] = field(default_factory=dict)
-
-    def add(self, path: Path) -> Path:
-        """Return where the file of a place is written first."""
-        self.copies[path] = self.scratch / f"{len(self.copies)}{path.suffix}"
-        return self.copies[path]
-
-    def move(self) -> None:
-        """Move all files to their places, in the order in which they were added."""
-        for path, copy in self.copies.items():
-            place = self.folder.path / path
-            place.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(copy, place)
-
-
 def _stage_weights(
-    folder: Folder, staging: _Staging, place: Place, file: PredictionsFile
+    folder: Folder,
+    stage: Callable[[Path], Path],
+    source: Path | None,
+    place: Place,
+    seed: int | None,
 ) -> Weights | None:
     """Copy weights and the log of their training, unless they lie there already."""
-    source = file.weights
     if source is None:
         return None
     sha256 = file_sha256(source)
@@ -445,12 +420,12 @@ def _stage_weights(
     if source.resolve().is_relative_to(board):
         inner = source.resolve().relative_to(board)
         return Weights(path=inner.as_posix(), sha256=sha256)
-    path = weights_path(place, file.header.seed, source)
-    shutil.copyfile(source, staging.add(path))
+    path = weights_path(place, seed, source)
+    shutil.copyfile(source, stage(path))
     for log in (source.with_suffix(".json"), source.with_name(TRAINING_LOG)):
         # the JSON file that `lagbench predict` writes about costs has no step
         if log.is_file() and "step" in json.loads(log.read_bytes()):
-            shutil.copyfile(log, staging.add(path.with_suffix(".json")))
+            shutil.copyfile(log, stage(path.with_suffix(".json")))
             break
     return Weights(path=path.as_posix(), sha256=sha256)
 
@@ -482,12 +457,14 @@ def _remove_stale_files(
 def _write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
     """Write the references of a score card that the folder lacks; return the files."""
     header = card.header
+    data_sha256 = header.dataset_sha256
     data_set_folder = folder.path / FLOORS / header.split / header.size
     written = []
     for name in card.tallies.keys() - {SUBMISSION}:
         path = data_set_folder / f"{name}.nc"
-        if _is_scored_on(path, header.dataset_sha256):
-            continue
+        with suppress(UnreadableFileError):
+            if read_statistics(path).identity["dataset_sha256"] == data_sha256:
+                continue
         path.parent.mkdir(parents=True, exist_ok=True)
         reference_card = replace(
             card,
@@ -498,10 +475,3 @@ def _write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
         write_statistics(reference_card, path, option="--board")
         written.append(path)
     return tuple(sorted(written))
-
-
-def _is_scored_on(path: Path, dataset_sha256: str) -> bool:
-    with suppress(UnreadableFileError):
-        identity = read_statistics(path).identity
-        return identity["dataset_sha256"] == dataset_sha256
-    return False

@@ -127,7 +127,7 @@ class VerifiedFile(RootModel[dict[str, Verification]]):
     """Records by path of the entry, relative to the leaderboard's folder."""
 
 
-def read_verified(folder: Folder) -> Mapping[str, Verification]:
+def read_verified(folder: Folder) -> dict[str, Verification]:
     """Return the records by path of the entry; empty without the file.
 
     Raises:
@@ -135,9 +135,8 @@ def read_verified(folder: Folder) -> Mapping[str, Verification]:
         ChecksFailedError: it holds something else.
     """
     path = folder.path / VERIFIED
-    if not path.exists():
-        return {}
-    return validate(VerifiedFile, read_yaml(path) or {}, path).root
+    content = read_yaml(path) if path.exists() else None
+    return validate(VerifiedFile, content or {}, path).root
 
 
 def verification_of(
@@ -148,16 +147,11 @@ def verification_of(
     None without one, and where it is about other score files or models.
     """
     line = verified.get(entry.yaml_path.as_posix())
-    if line is None or line.scores != _score_hashes(entry):
+    if line is None or line.scores != entry.score_hashes:
         return None
-    models = {}
-    for prediction in entry.predictions:
-        if prediction.weights is not None:
-            models[prediction.seed] = prediction.weights.sha256
-    for reproduction in line.reproduced:
-        if models.get(reproduction.seed) != reproduction.model:
-            return None
-    return line
+    if entry.models.issuperset((one.seed, one.model) for one in line.reproduced):
+        return line
+    return None
 
 
 def record(
@@ -165,7 +159,7 @@ def record(
 ) -> Verification:
     """Change the record of an entry, an empty one where it has none; return it."""
     with folder.lock():
-        verified = dict(read_verified(folder))
+        verified = read_verified(folder)
         line = verification_of(entry, verified) or empty_record(entry)
         renewed = {"lagbench": version("lagbench"), "date": today()}
         changed = change(line).model_copy(update=renewed)
@@ -177,7 +171,7 @@ def record(
 def empty_record(entry: Entry) -> Verification:
     """Return the record of an entry that nobody followed."""
     return Verification(
-        scores=_score_hashes(entry),
+        scores=entry.score_hashes,
         lagbench=version("lagbench"),
         date=today(),
         level=Level.AS_SUBMITTED,
@@ -186,7 +180,7 @@ def empty_record(entry: Entry) -> Verification:
 
 def remove_stale_record(folder: Folder, entry: Entry) -> bool:
     """Remove the record of other score files of an entry; return whether there was."""
-    verified = dict(read_verified(folder))
+    verified = read_verified(folder)
     name = entry.yaml_path.as_posix()
     if name not in verified or verification_of(entry, verified) is not None:
         return False
@@ -228,7 +222,3 @@ def _write(folder: Folder, verified: Mapping[str, Verification]) -> None:
         always = {"date": line.date, "level": line.level}
         lines[path] = first_keys | always | values
     write_atomically(folder.path / VERIFIED, yaml_bytes(lines), option="--board")
-
-
-def _score_hashes(entry: Entry) -> tuple[str, ...]:
-    return tuple(file.sha256 for file in entry.score.files)

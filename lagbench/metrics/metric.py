@@ -209,7 +209,8 @@ class Metric:
                 f"no direction {self.direction!r}; name one of {', '.join(Direction)}",
                 where=where,
             )
-        if isinstance(self.of, str):
+        of: object = self.of  # a package may write a text
+        if isinstance(of, str):
             raise UsageError(f"of is a text; write of=({self.of!r},)", where=where)
         if self.statistic is None and not self.of:
             raise UsageError(

@@ -22,7 +22,7 @@ from lagbench.board.verified import Level, read_verified
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
-from lagbench.scoring.scenario import SUBMISSION
+from lagbench.scoring.task import SUBMISSION
 
 
 @pytest.fixture

@@ -59,8 +59,8 @@ from lagbench.references.train_library import (
     state_library,
 )
 from lagbench.scoring.references import measurable
-from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.skill import best_reference
+from lagbench.scoring.task import SUBMISSION
 
 Floats = NDArray[np.float64]
 
