@@ -431,7 +431,9 @@ def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> s
     all_names = ", ".join(size.name for size in sizes)
     if names:
         raise UsageError(
-            f"several sizes are there: {', '.join(names)}; name one", where="--size"
+            f"several sizes are there: {', '.join(names)}; name one, as in --size "
+            f"{names[0]}",
+            where="--size",
         )
     size = registry.size(split, _size_to_make(location))
     hint = suggest_repair(size, root=root)

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -100,25 +99,6 @@ def test_list_shows_one_split_with_its_references(
         score = measured[name].scores["vorticity_nrmse"]
         assert value == pytest.approx(score.mean)
     assert "persistence" in references
-
-
-def test_list_shows_a_local_split_by_its_folder(run: Run, tmp_path: Path) -> None:
-    """The references of such a split are measured with each score."""
-    runs = np.stack(straight_runs(3))
-    np.save(tmp_path / "runs.npy", runs)
-    own = lagbench.adopt(
-        tmp_path / "runs.npy",
-        output=tmp_path / "own",
-        radius=0.1,
-        frame_interval=0.25,
-        axes="trajectory,frame,particle,space",
-    )
-    result = run("list", f"{own.folder}/")
-    assert result.exit_code == 0
-    assert "with each score" in result.stdout
-    result = run("list", "cavitty", "--root", tmp_path)
-    assert result.exit_code == 2
-    assert "'cavity'" in result.stderr
 
 
 def test_what_strangers_say_of_a_split_commands_no_terminal(
@@ -232,26 +212,6 @@ def project_version() -> str:
     return version
 
 
-def test_a_tag_names_the_version() -> None:
-    """The tag of a release is v and the version, which heads the changelog too."""
-    # Outside of git, and in an archive that was unpacked in another repository, there
-    # are no tags of ours.
-    is_clone = (CLONE / ".git").exists()
-    if not is_clone or shutil.which("git") is None:
-        pytest.skip("no clone")
-    command = ["git", "-C", str(CLONE), "tag", "--points-at", "HEAD"]
-    command += ["--list", "v[0-9]*"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    tags = done.stdout.split()
-    if not tags:
-        pytest.skip("no tag at HEAD")
-    version = project_version()
-    assert tags == [f"v{version}"]
-    changelog = (CLONE / "CHANGELOG.md").read_text()
-    headings = re.findall(r"^## (.*)$", changelog, re.MULTILINE)
-    assert version in headings[0]
-
-
 def bibtex_fields(text: str) -> dict[str, str]:
     """Return the fields of a BibTeX entry."""
     assert text.count("{") == text.count("}")
@@ -272,45 +232,10 @@ def test_bibtex_of_lagbench_is_that_of_citation_cff(run: Run) -> None:
     }
 
 
-def test_bibtex_of_a_split_has_its_version_and_every_hash(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("LAGBENCH_REGISTRY")
-    registry = load()
-    bibtex = run("cite", "cavity", "--bibtex").stdout
-    fields = bibtex_fields(bibtex)
-    assert fields["version"] == registry.split("cavity").version
-    measured = registry.measured["cavity"]
-    assert len(measured) == 3
-    for size in measured.values():
-        assert size.dataset_sha256 in fields["note"]
-
-
-def write_registry(path: Path, registry: dict[str, Any], **changes: str) -> None:
-    """Write a registry whose split cavity has other values."""
-    cavity = {**registry["splits"]["cavity"], **changes}
-    changed = {**registry, "splits": {"cavity": cavity}}
-    path.write_text(yaml.safe_dump(changed))
-
-
-def test_without_a_split_lagbench_itself_is_cited(run: Run) -> None:
-    result = run("cite")
-    assert result.exit_code == 0
-    assert lagbench.__version__ in result.stdout
-    data = printed_data(run, "cite")
-    assert data["version"] == lagbench.__version__
-
-
 def test_a_citation_names_the_work_behind_the_split(run: Run) -> None:
     assert "Ghia" in run("cite", "cavity").stdout
     data = printed_data(run, "cite", "cavity")
     assert data["licence"] == "CC-BY-4.0"
-
-
-def library_name(requirement: str) -> str:
-    """Return the name of a library that the package requires."""
-    name, *_ = re.split(r"[^\w.-]", requirement)
-    return name.lower()
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:
@@ -318,14 +243,6 @@ def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:
     states = {check["name"]: check["state"] for check in data["checks"]}
     for name in ("numpy", "registry", "data folder"):
         assert states[name] == "ok"
-
-
-def test_doctor_finds_a_root_that_cannot_be_written(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    result = run("doctor", "--root", tmp_path / "file" / "data")
-    assert result.exit_code == 1
-    assert "data broken" in result.stderr
-    assert "--root" in result.stdout
 
 
 STRANGE_FILES = ("notes.txt", "mine.png", "pictures/mine.png")
@@ -351,15 +268,6 @@ def test_clean_removes_a_data_set_but_no_other_file(run: Run, copied: Copied) ->
     assert run(*words).exit_code == 0
     assert list(root.iterdir()) == []
     assert run(*words).exit_code == 0
-
-
-def test_clean_may_remove_leftovers_only(run: Run, copied: Copied) -> None:
-    root = copied()
-    leftover = root / SPLIT / SIZE / "v2" / "test" / ".0003.nc.1.partial"
-    leftover.write_text("")
-    tiny = [SPLIT, "--size", SIZE, "--root", root]
-    data = printed_data(run, "clean", *tiny, "--leftovers")
-    assert data["removed"] == [str(leftover)]
 
 
 def test_a_dry_run_of_clean_removes_nothing_and_takes_no_lock(

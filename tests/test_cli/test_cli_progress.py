@@ -59,45 +59,6 @@ def test_progress_without_scenarios_is_shown_in_per_cent(
     assert capsys.readouterr().err == "costs: 38%\n"
 
 
-def test_an_unknown_total_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar(quiet=False, seconds_per_line=0.0) as listener:
-        assert listener is not None
-        listener(WRITING)
-    assert capsys.readouterr().err == "writing train: 2 scenarios, 2.00/s\n"
-
-
-def slow_scoring(done: int, seconds: float) -> Progress:
-    """Return the progress of a scoring of 20 scenarios."""
-    return Progress(
-        stage="scoring",
-        done=done,
-        total=20,
-        scenarios_done=done,
-        scenarios=20,
-        seconds=seconds,
-    )
-
-
-@pytest.mark.parametrize(
-    ("done", "seconds", "told"),
-    [
-        (0, 12.0, "0%, 0/20 scenarios"),
-        (2, 250.0, "10%, 2/20 scenarios, 2 min per scenario, 38 min left"),
-        (2, 25.0, "10%, 2/20 scenarios, 12.5 s per scenario, 4 min left"),
-        (5, 4.0, "25%, 5/20 scenarios, 1.25/s, 12 s left"),
-    ],
-)
-def test_slow_progress_is_shown_in_seconds_per_scenario(
-    done: int, seconds: float, told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Below one a second the time of one is shown; before the first there is none."""
-    with progress_bar(quiet=False, seconds_per_line=0.0) as listener:
-        assert listener is not None
-        listener(slow_scoring(done, seconds))
-    line = capsys.readouterr().err
-    assert line == f"scoring: {told}\n"
-
-
 def test_quick_work_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_bar(quiet=False, unit="steps", seconds_per_line=3600.0) as listener:
         assert listener is not None

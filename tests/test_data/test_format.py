@@ -95,20 +95,6 @@ def test_xarray_opens_it_unaided(written: Written, engine: str) -> None:
     assert names == MATERIALS
 
 
-def test_plain_h5py_opens_it(written: Written) -> None:
-    """Chunks hold one frame; the only filters are shuffle and zlib level 1."""
-    path, _ = written
-    with h5py.File(path) as file:
-        for name in ("position", "velocity"):
-            variable = file[name]
-            assert variable.chunks == (1, 8, 2)
-            assert variable.compression == "gzip"
-            assert variable.compression_opts == 1
-            assert variable.shuffle
-        velocities = -frames_of(3, 4, 8)
-        assert_array_equal(file["velocity"][...], velocities)
-
-
 def test_equal_scenarios_have_equal_bytes(tmp_path: Path) -> None:
     """With one set of libraries nothing depends on the clock."""
     first, _ = write_scenario(tmp_path / "a", KEY)
@@ -232,40 +218,6 @@ def test_changed_attributes_are_found(
     assert_refused(path, "attributes differ", "attributes")
 
 
-@pytest.mark.parametrize(
-    ("variable", "name", "value"),
-    [
-        ("position", "scale_factor", 2.0),
-        ("velocity", "add_offset", 1.0),
-        ("position", "_FillValue", np.array([0.5], np.float32)),
-        ("material", "missing_value", np.int8(0)),
-        ("position", "valid_max", np.float32(0.5)),
-        ("velocity", "valid_range", np.array([0.0, 0.5], np.float32)),
-        ("material", "_Unsigned", "true"),
-        ("position", "units", "m"),
-        ("time", "units", "days since 2000-01-01"),
-        ("material", "flag_meanings", "rope snow jelly liquid"),
-        ("material", "flag_values", np.array([3, 2, 1, 0], np.int8)),
-        ("velocity", "coordinates", None),
-    ],
-)
-def test_attributes_that_change_the_meaning_are_refused(
-    written: Written,
-    variable: str,
-    name: str,
-    value: object,
-) -> None:
-    """The values are the same, yet readers that follow CF would read others."""
-    path, content = written
-    with h5py.File(path, "r+") as file:
-        if value is None:
-            del file[variable].attrs[name]
-        else:
-            file[variable].attrs[name] = value
-    assert rehash(path) == content
-    assert_refused(path, f"variable '{variable}'", name)
-
-
 @pytest.mark.slow
 def test_no_flipped_byte_escapes_as_another_error(written: Written) -> None:
     """Each of 200 flips leaves the content as it is or gives a DataError."""
@@ -299,15 +251,6 @@ def test_a_truncated_file_is_damage(written: Written, share: float) -> None:
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     assert_refused(tmp_path / "0000.nc", "missing", check=read_scenario)
-
-
-def test_a_shape_of_terabytes_in_kilobytes_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "large.nc"
-    with h5py.File(path, "w") as file:
-        file.create_dataset("position", (2**40,), "f4", chunks=(1024,))
-    assert_refused(
-        path, "larger than its file", "variable 'position'", check=read_scenario
-    )
 
 
 def open_writer(path: Path, **changes: Any) -> ScenarioWriter:
@@ -352,17 +295,6 @@ def test_the_order_of_the_periodic_axes_changes_nothing(tmp_path: Path) -> None:
         with read_scenario(tmp_path / "c.nc") as stored:
             assert stored.header.parameters["periodic"] == "x y"
     assert len(hashes) == 1
-
-
-def test_other_readers_may_have_the_file_open(written: Written) -> None:
-    """HDF5 opens a file twice in a process only if both openings treat locks alike."""
-    path, _ = written
-    with (
-        h5py.File(path, "r"),
-        read_scenario(path) as file,
-        h5py.File(path, "r"),
-    ):
-        assert file.header.particles == 8
 
 
 def test_frames_and_slices_can_be_read(written: Written) -> None:
@@ -414,41 +346,3 @@ def test_a_parameter_may_be_stated_after_the_frames(tmp_path: Path) -> None:
         assert check_scenario(tmp_path / name) == at_first
         with read_scenario(tmp_path / name) as file:
             assert file.header.parameters == both
-
-
-FRAME = np.zeros((8, 2), np.float32)
-FRAME_IN_DOUBLES = FRAME.astype(np.float64)
-
-
-@pytest.mark.parametrize(
-    ("position", "velocity", "words"),
-    [
-        (FRAME, FRAME[:4], r"velocity"),
-        (FRAME[:1], FRAME, r"position"),
-        (FRAME, FRAME, r"position"),
-        (FRAME_IN_DOUBLES, FRAME, r"position"),
-    ],
-)
-def test_wrong_frames_are_refused(
-    tmp_path: Path,
-    position: Any,
-    velocity: Any,
-    words: str,
-) -> None:
-    """No file appears, not even a temporary one, and an old file survives."""
-    path, content = write_scenario(tmp_path, KEY)
-    with pytest.raises(DataError, match=words), open_writer(path) as file:
-        file.append(position, velocity)
-    assert check_scenario(path) == content
-    assert list(path.parent.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("name", ["a" * 256, "\u00e9" * 128, "_depth"])
-def test_a_long_name_of_a_parameter_survives_the_file(
-    tmp_path: Path, name: str
-) -> None:
-    path, content = write_scenario(tmp_path, KEY, parameters={name: 1})
-    with read_scenario(path) as file:
-        assert file.header.parameters[name] == 1
-    assert check_scenario(path) == content
-    assert independent_hash.content_hash(path) == content

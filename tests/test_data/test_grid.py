@@ -279,18 +279,6 @@ def test_wall_nodes_count_and_corner_nodes_do_not() -> None:
     assert_array_equal(fields.counted, expected)
 
 
-def test_vorticity_stands_where_four_neighbours_count() -> None:
-    """A node on the rim, or next to one that does not count, has no vorticity."""
-    counted = np.ones((6, 6), bool)
-    counted[2, 3] = False
-    expected = np.zeros((6, 6), bool)
-    expected[1:-1, 1:-1] = True
-    for neighbour in ((1, 3), (3, 3), (2, 2), (2, 4)):
-        expected[neighbour] = False
-    actual = gridding.differentiable_nodes(counted)
-    assert_array_equal(actual, expected)
-
-
 def test_nodes_that_a_prediction_leaves_empty_have_velocity_zero() -> None:
     """Below a thousandth of a full weight the velocity is 0."""
     weight = np.array([[0.0, 3.9e-3, 4.1e-3]])

@@ -20,7 +20,6 @@ from lagbench.data.manifest import (
     read_manifest,
     write_manifest,
 )
-from lagbench.errors import DataError
 
 SUBSETS = {
     "train": (0, 1),
@@ -133,22 +132,6 @@ def test_scenarios_that_a_size_has_dropped_go() -> None:
     assert changed.entry(5) is None
 
 
-def test_entries_under_another_subset_go() -> None:
-    """The registry decides which subset has a scenario."""
-    whole = merge(None, range(5))
-    entries = list(whole.files)
-    in_train = entries[3].model_copy(update={"subset": "train"})
-    entries[3] = in_train
-    moved = whole.model_copy(update={"files": tuple(entries)})
-    merged = merge(moved, ())
-    assert listed_scenarios(merged) == [0, 1, 2, 4]
-
-
-def test_an_incomplete_train_has_no_statistics() -> None:
-    manifest = merge(None, (0, 3), statistics=STATISTICS)
-    assert manifest.statistics == {}
-
-
 def test_statistics_stay_when_a_later_run_brings_none() -> None:
     train = merge(None, (0, 1), statistics=STATISTICS)
     assert train.statistics == STATISTICS
@@ -255,54 +238,6 @@ def test_a_written_manifest_is_read_back(tmp_path: Path) -> None:
     facts = content["files"][3]["facts"]
     assert facts == {"energy_last_over_max": 0.25}
     assert read_manifest(tmp_path, "cavity", "tiny", 2) is None
-
-
-def write_whole(folder: Path) -> Path:
-    """Write the manifest of a complete data set."""
-    manifest = merge(None, range(5))
-    return write_manifest(folder, manifest)
-
-
-@pytest.mark.parametrize(
-    ("changes", "entry_changes", "key"),
-    [
-        # wrong types, unknown keys and formats
-        ({"complete": "yes"}, {}, "complete"),
-        ({"files": [{"scenario": 1}]}, {}, "files.0.subset"),
-        ({"colour": 1}, {}, "colour"),
-        ({"format": 2}, {}, "format"),
-        # an entry cannot name a file elsewhere
-        ({}, {"path": "../../../../../etc/passwd"}, "files.3.path"),
-        ({}, {"path": "/etc/passwd"}, "files.3.path"),
-        ({}, {"path": "train/0004.nc"}, "files.3.path"),
-        ({}, {"subset": "..", "path": "../0003.nc"}, "files.3.subset"),
-        (
-            {},
-            {"subset": "../../etc", "path": "../../etc/0003.nc"},
-            "files.3.subset",
-        ),
-        # nor the whole be another data set's, whose files would be read and written
-        ({"split": "../../../etc"}, {}, ""),
-        ({"size": "mini"}, {}, ""),
-        ({"version": "2.0.0"}, {}, ""),
-        ({"version": "x.0.0"}, {}, "version"),
-    ],
-)
-def test_a_damaged_manifest_names_the_key(
-    tmp_path: Path,
-    changes: dict[str, Any],
-    entry_changes: dict[str, str],
-    key: str,
-) -> None:
-    """The error has file and key."""
-    path = write_whole(tmp_path)
-    content = json.loads(path.read_text())
-    content["files"][3] |= entry_changes
-    path.write_text(json.dumps(content | changes))
-    with pytest.raises(DataError) as caught:
-        read_manifest(tmp_path, "cavity", "tiny", 1)
-    assert caught.value.where == str(path)
-    assert key in str(caught.value)
 
 
 def test_entry_of_a_file_on_disk(tmp_path: Path) -> None:

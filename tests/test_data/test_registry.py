@@ -7,19 +7,15 @@ from __future__ import annotations
 import copy
 import functools
 import math
-import os
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 
-from lagbench.baselines.augmentation import check_symmetry
 from lagbench.data import registry
 from lagbench.data.box import Box
 from lagbench.data.limits import NEEDED, SUBSETS, check_parameters
@@ -27,12 +23,9 @@ from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.generators.batch import draw_initial_state
-from lagbench.generators.constants import LIMITS, solver_constants
-from lagbench.generators.full_box_parameters import FullBoxParameters
+from lagbench.generators.constants import LIMITS
 from lagbench.make.generate import generate
 from lagbench.make.verify import verify
-from lagbench.references.projection import forcing_of
 
 SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
 LARGE_RELATIVES = (
@@ -89,27 +82,6 @@ def test_full_sizes_are_those_of_the_documentation(
 def run_of_ids(first: int, last: int) -> tuple[int, ...]:
     """Return consecutive ids of scenarios."""
     return tuple(range(first, last + 1))
-
-
-def test_subsets_are_runs_of_ids() -> None:
-    """The subset extra and the long scenarios of fluid are the documented ones."""
-    registry = load()
-    fluid = registry.size("fluid", "full")
-    assert fluid.subsets["test"] == run_of_ids(36, 51)
-    assert fluid.subsets["valid"] == run_of_ids(28, 35)
-    assert fluid.frame_count(0) == 600
-    assert fluid.frame_count(26) == 600
-
-    multimaterial = registry.size("multimaterial", "full")
-    extra = multimaterial.subsets["extra"]
-    assert extra == run_of_ids(72, 86)
-    frame_counts = {multimaterial.frame_count(scenario) for scenario in extra}
-    assert frame_counts == {1200}
-
-    cavity = registry.size("cavity", "full")
-    assert cavity.subsets["test"] == run_of_ids(56, 75)
-    noise = registry.size("curl-noise", "full")
-    assert noise.subsets["test"] == run_of_ids(56, 71)
 
 
 @pytest.mark.parametrize("size", ["full", "mini", "tiny"])
@@ -257,27 +229,6 @@ def test_a_registry_of_ones_own(
     with pytest.raises(UnreadableFileError) as caught:
         load()
     assert caught.value.where.endswith("none.yaml")
-
-
-def test_a_path_that_means_another_file_is_read_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After a change of the working folder, also where both files are equally old."""
-    split_counts = []
-    for folder, left_out in (("first", ["fluid"]), ("second", ["fluid", "cavity"])):
-        place = tmp_path / folder
-        place.mkdir()
-        path = edited(place, lambda splits, names=left_out: drop(splits, names))
-        os.utime(path, ns=(10**18, 10**18))
-        monkeypatch.chdir(place)
-        split_counts.append(len(load(Path(path.name)).splits))
-    assert split_counts[0] == split_counts[1] + 1
-
-
-def drop(splits: dict[str, Any], names: Sequence[str]) -> None:
-    """Take splits away."""
-    for name in names:
-        del splits[name]
 
 
 def renamed(split: str, old: str, new: str) -> Change:
@@ -459,61 +410,6 @@ def test_a_solver_that_cannot_be_fed_is_refused_before_work(
     refused(path, parts, regenerate)
 
 
-def with_fringe(length: float | None, rate: float) -> Change:
-    """Return a change that states a fringe of poiseuille, perhaps without a length."""
-
-    def change(splits: dict[str, Any]) -> None:
-        values = {"fringe_rate": rate}
-        if length is not None:
-            values["fringe_length"] = length
-        for name, value in values.items():
-            splits["poiseuille"]["parameters"][name] = {
-                "value": value,
-                "unit": "1",
-                "description": "of the fringe",
-            }
-
-    return change
-
-
-@pytest.mark.parametrize("length", [None, 0.0, 0.2])
-def test_a_rate_of_zero_stands_for_no_fringe(
-    tmp_path: Path, length: float | None
-) -> None:
-    """The solver has its own constants, and references and models see no stream."""
-    path = edited(tmp_path, with_fringe(length, 0.0))
-    size = load(path).size("poiseuille", "tiny")
-    parameters = solver_constants(size)
-    assert isinstance(parameters, FullBoxParameters)
-    place = np.array([0.5, 0.95, 1.0])
-    assert parameters.fringe_rates(place).tolist() == [0.0, 0.0, 0.0]
-    assert forcing_of(size, np.array([0.5, 0.5, 0.1])) is None
-    check_symmetry("square", size, find_forcing=tuple)
-
-
-UNUSABLE = always("area_min", value="big")
-UNUSABLE_PARTS = ("size tiny", "generators.fluid can use", "area_min = 'big'")
-
-
-@pytest.mark.parametrize(
-    ("change", "parts"),
-    [
-        (UNUSABLE, UNUSABLE_PARTS),
-        (
-            renamed("fluid", "area_max", "aera_max"),
-            ("size tiny", "did you mean 'aera_max'?", "'area_max'"),
-        ),
-    ],
-)
-def test_a_scenario_that_cannot_be_drawn_is_refused(
-    change: Change, parts: Parts, tmp_path: Path
-) -> None:
-    path = edited(tmp_path, change)
-    size = load(path).size("fluid", "tiny")
-    draw = partial(draw_initial_state, size, 0)
-    refused(path, parts, draw)
-
-
 def test_our_own_values_hold_with_room() -> None:
     """Every number of ours lies within its limit, at every size, or the limits are
     wrong.
@@ -635,33 +531,6 @@ def test_a_broken_package_is_left_out(
         found = plugged(**sources)
     assert len(warnings) == 1
     assert found.splits == load(default_path()).splits
-
-
-METADATA = "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
-
-
-def install_waves(root: Path, entry_points: str) -> Path:
-    """Install a package and return the folder with its metadata."""
-    folder = root / "wave_splits-1.0.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text(METADATA)
-    (folder / "entry_points.txt").write_text(entry_points)
-    return folder
-
-
-def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package installed after the first look is found, and one that was uninstalled
-    is not.
-    """
-    monkeypatch.syspath_prepend(tmp_path)
-    os.utime(tmp_path, (0, 0))  # times of change have some milliseconds of grain
-    assert registry.list_entry_points("some.group") == ()
-    folder = install_waves(tmp_path, "[some.group]\nwaves = wave_splits\n")
-    (point,) = registry.list_entry_points("some.group")
-    assert point.name == "waves"
-    shutil.rmtree(folder)
-    os.utime(tmp_path, (1, 1))
-    assert registry.list_entry_points("some.group") == ()
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ import yaml
 from conftest import PAINT_PICTURES
 from rotating_disc import write_swirl
 
-from lagbench.atomic import ROOT_OPTION
 from lagbench.data import registry
 from lagbench.data.layout import PICTURES, dataset_folder
 from lagbench.data.manifest import (
@@ -29,7 +28,6 @@ from lagbench.data.manifest import (
     read_or_empty,
 )
 from lagbench.data.registry import Size
-from lagbench.errors import WorkFailedError
 from lagbench.figures.tables import escape
 from lagbench.make import cards
 from lagbench.make.croissant import croissant_json
@@ -89,22 +87,6 @@ def card(size: Size, manifest: Manifest, **update: object) -> str:
     split = registry.load().split(size.split)
     changed = manifest.model_copy(update=update)
     return cards.dataset_card(size, split, changed, pictures=[])
-
-
-@pytest.mark.slow
-def test_pictures_that_cannot_be_written_name_the_root(tmp_path: Path) -> None:
-    """`lagbench generate` has no --output."""
-    size, manifest = make(tmp_path)
-    split = registry.load().split(size.split)
-    for name in PICTURES:
-        picture = size.folder(tmp_path) / name
-        picture.mkdir(parents=True)
-        with pytest.raises(WorkFailedError) as caught:
-            PAINT_PICTURES(tmp_path, size, split, manifest)
-        assert str(picture) in str(caught.value.where)
-        assert ROOT_OPTION in str(caught.value.fix)
-        assert "--output" not in str(caught.value)
-        picture.rmdir()
 
 
 def run_program(*command: str) -> subprocess.CompletedProcess[str]:
@@ -296,17 +278,6 @@ def test_without_matplotlib_or_files_there_are_no_pictures(
     assert len(document["distribution"]) == len(scenarios)
 
 
-def test_a_partial_data_set_says_so(tmp_path: Path) -> None:
-    """Before it is complete there is no data set hash, and subsets count what is
-    there.
-    """
-    size, manifest = make(tmp_path, scenarios=(0, 3))
-    text = card(size, manifest)
-    assert "none before it is complete" in text
-    assert "| train | 0-1 | 1 of 2 |" in text
-    assert "Statistics of train" not in text
-
-
 def test_a_copy_of_tolerant_identity_does_not_promise_equal_bits(
     tmp_path: Path,
 ) -> None:
@@ -316,29 +287,6 @@ def test_a_copy_of_tolerant_identity_does_not_promise_equal_bits(
     assert "same bits" in exact
     tolerant = card(size, manifest, identity="tolerance")
     assert "same bits" not in tolerant
-
-
-def test_snow_snow_comes_to_rest_and_its_card_says_so() -> None:
-    """The note of multimaterial is on its card and on no other."""
-    for name in registry.load().splits:
-        size = registry.load().size(name, "tiny")
-        manifest = Manifest(split=name, size="tiny", version=size.version)
-        text = card(size, manifest)
-        has_note = "Pairs with snow come to rest first" in text
-        assert has_note == name.startswith("multimaterial")
-
-
-@pytest.mark.parametrize("name", sorted(cards.NOTES))
-def test_names_in_the_note_of_a_split_are_code(name: str) -> None:
-    """No backtick of a note is escaped: `active_frames` reads as a name. Without what
-    is escaped the card has the note as it is written.
-    """
-    size = registry.load().size(name, "tiny")
-    manifest = Manifest(split=name, size="tiny", version=size.version)
-    text = card(size, manifest)
-    assert "\\`" not in text
-    plain = " ".join(re.sub(r"\\(.)", r"\1", text).split())
-    assert " ".join(cards.NOTES[name].split()) in plain
 
 
 @pytest.mark.parametrize(

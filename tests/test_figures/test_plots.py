@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from rotating_disc import OMEGA, write_swirl
 
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.figures.canvas import ENDINGS, figure, save
 from lagbench.figures.colours import MATERIAL_COLOURS, parse_rgb
 from lagbench.figures.panels import (
@@ -26,7 +26,7 @@ from lagbench.figures.panels import (
     strongest_limit,
 )
 from lagbench.figures.pictures import plot
-from lagbench.figures.plot import contact_sheet, describe, draw_frame
+from lagbench.figures.plot import contact_sheet, draw_frame
 from lagbench.figures.recording import open_recording
 
 Pixels = NDArray[np.uint8]
@@ -71,12 +71,6 @@ def test_vorticity_of_solid_body_rotation(swirl: Path, frame: int) -> None:
         assert limit == pytest.approx(expected)
 
 
-def test_area_is_that_of_the_material(swirl: Path) -> None:
-    """The disc has radius 0.4."""
-    with open_recording(swirl) as recording:
-        assert recording.area == pytest.approx(np.pi * 0.4**2)
-
-
 def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> None:
     """Speeds of a disc are OMEGA r; 99 of 100 particles are within 0.4 sqrt(0.99)."""
     with open_recording(swirl) as recording:
@@ -85,22 +79,6 @@ def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> Non
         expected = angular_velocity * 0.4 * np.sqrt(0.99)
         limit = limit_of(Panel.SPEED, scene)
         assert limit == pytest.approx(expected, rel=1e-3)
-
-
-def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
-    """Reynolds number, family or frequency stand beside split, size and id."""
-    with open_recording(swirl) as recording:
-        assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
-    parameters = {"family": "splash"}
-    splash = write_swirl(
-        tmp_path,
-        "fluid",
-        3,
-        walls=None,
-        parameters=parameters,
-    )
-    with open_recording(splash) as recording:
-        assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
 
 
 def build_uniform_flow(velocity: tuple[float, float], *, lattice: int) -> xr.Dataset:
@@ -241,8 +219,3 @@ def test_a_moving_wall_is_marked(swirl: Path) -> None:
     for head in heads:
         tip, *base = head.get_xy()[:3]
         assert all(tip[0] > corner[0] for corner in base)
-
-
-def test_a_sheet_without_scenarios_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError):
-        contact_sheet("cavity", "tiny", tmp_path / "s.png", root=tmp_path)

@@ -70,13 +70,6 @@ def test_up_is_up_and_the_back_is_farther() -> None:
     assert view.depth(centre + back) > view.depth(centre)
 
 
-def test_three_edges_meet_in_front() -> None:
-    edges = list(View(CUBE).edges())
-    assert len(edges) == 12
-    front_count = sum(is_front for _, is_front in edges)
-    assert front_count == 3
-
-
 def test_the_farthest_particle_is_the_palest() -> None:
     black = np.zeros((2, 3))
     depths = np.array([0.0, 1.0])

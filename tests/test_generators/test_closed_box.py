@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.draws import quantise
 from lagbench.generators.full_box_parameters import FullBoxParameters
-from lagbench.generators.obstacle import Obstacle
 from lagbench.generators.split import Device, InitialState
 
 # Each module of kernels takes seconds to compile.
@@ -377,53 +376,3 @@ def test_states_outside_the_bounds_are_refused() -> None:
         with pytest.raises(UsageError) as caught:
             loaded(constants, [moving])
         assert str(caught.value.where).startswith("scenario 0, wall_velocity")
-
-
-@pytest.mark.parametrize(
-    "driving",
-    [
-        {"body_force": np.ones((1, 1, 2))},
-        {"stream": np.ones(2)},
-        {
-            "obstacle": Obstacle(
-                centre=(0.5, 0.5), radius=0.1, position=np.zeros((0, 2))
-            )
-        },
-        {"friction": 0.1},
-    ],
-    ids=["force", "stream", "obstacle", "friction"],
-)
-def test_what_the_solver_has_not_is_refused(driving: dict[str, Any]) -> None:
-    """The file would state a force that never acted."""
-    state = dataclasses.replace(scenario(NO_SLIP, seed=9), **driving)
-    with pytest.raises(UsageError) as caught:
-        loaded(NO_SLIP, [state])
-    (name,) = driving
-    assert caught.value.where == f"scenario 0, {name}"
-
-
-def test_a_blow_up_names_the_viscosity_among_its_causes() -> None:
-    """Of nu dt / dx^2 = 10, explicit diffusion grows without bound."""
-    viscosity = 10.0 / (NO_SLIP.dt * NO_SLIP.grid**2)
-    solver = loaded(NO_SLIP, [scenario(NO_SLIP, speed=0.1, viscosity=viscosity)])
-    with pytest.raises(WorkFailedError) as caught:
-        solver.advance(100)
-    assert "viscosity" in str(caught.value.fix)
-
-
-@pytest.mark.parametrize(
-    "walls",
-    [
-        np.zeros((3, 2)),
-        np.zeros(0),
-        np.zeros((0, 4, 2)),
-        np.zeros((4, 2)).tolist(),
-        np.full((4, 2), "slow"),
-    ],
-)
-def test_walls_that_are_no_program_are_refused(walls: Any) -> None:
-    """The velocities of walls are an array with finite rows."""
-    state = dataclasses.replace(scenario(NO_SLIP, seed=9), wall_velocity=walls)
-    with pytest.raises(UsageError) as caught:
-        loaded(NO_SLIP, [state])
-    assert "wall_velocity" in str(caught.value.where)

@@ -8,27 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
-from matplotlib.patches import Polygon
 from scenario_draws import draw
 
 import lagbench
-from lagbench.baselines.augmentation import mirror_batch
 from lagbench.data import registry
 from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import read_scenario
-from lagbench.figures.canvas import figure
 from lagbench.figures.colours import WALL
-from lagbench.figures.panels import draw_walls
 from lagbench.figures.plot import contact_sheet
-from lagbench.figures.recording import open_recording
 from lagbench.generators import cylinder
 from lagbench.make.generate import GenerationResult
 from lagbench.references import given_in
 from lagbench.references.projection import forcing_of
-from lagbench.torch import WindowDataset, collate
 
 REGISTRY = registry.load()
 SIZES = {
@@ -145,43 +138,6 @@ def test_windows_state_the_disc_and_no_particle_enters_it(
     for entry in manifest.files:
         assert entry.facts["jacobian_min"] > 0.85
         assert entry.facts["jacobian_max"] < 1.15
-
-
-@pytest.mark.slow
-def test_batches_carry_the_disc(tiny_split: Callable[..., GenerationResult]) -> None:
-    """A batch has one row for each window; in a mirror image the disc stands as far
-    from the other wall.
-    """
-    root = tiny_split("cylinder").root
-    size = SIZES["tiny"]
-    data = WindowDataset("cylinder", size="tiny", root=root, history=2)
-    batch = collate([data[0], data[1]])
-    assert batch.obstacle is not None
-    assert batch.obstacle.shape == (2, 3)
-    upside_down = torch.diag(torch.tensor([1.0, -1.0])).expand(2, 2, 2)
-    image = mirror_batch(batch, upside_down, size.bounds)
-    assert image.obstacle is not None
-    x, y, radius = batch.obstacle.unbind(1)
-    low, high = size.bounds[1]
-    expected = torch.stack([x, low + high - y, radius], dim=1)
-    torch.testing.assert_close(image.obstacle, expected)
-
-
-def test_pictures_show_the_disc(tiny_split: Callable[..., GenerationResult]) -> None:
-    """All corners of a polygon lie on its rim."""
-    root = tiny_split("cylinder").root
-    size = SIZES["tiny"]
-    path = size.path(root, size.subsets["test"][0])
-    with open_recording(path) as recording, figure(2.0, 2.0) as drawn:
-        axes = drawn.add_axes((0, 0, 1, 1))
-        draw_walls(axes, recording, 0)
-        discs = [patch for patch in axes.patches if isinstance(patch, Polygon)]
-        x, y, radius = recording.obstacle
-    (disc,) = discs
-    corners = np.asarray(disc.get_xy())
-    distances = np.hypot(corners[:, 0] - x, corners[:, 1] - y)
-    np.testing.assert_allclose(distances, radius, rtol=1e-5)
-    np.testing.assert_allclose(corners[:-1].mean(axis=0), [x, y], atol=2e-3)
 
 
 def test_a_sheet_of_a_channel_is_low(

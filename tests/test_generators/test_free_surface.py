@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from free_surface_scenarios import Part, parameters, run, scenario, start
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import WorkFailedError
 from lagbench.generators.free_surface import FreeSurface, courant
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.split import Device, InitialState, Material
@@ -266,52 +265,6 @@ def test_what_is_not_a_number_is_reported(poison: float, device: Device) -> None
     assert names_bound == names_value
     assert "e+38" not in str(caught.value)
     assert solver.position().min() >= np.float32(LOW)
-
-
-def test_states_that_do_not_fit_are_refused() -> None:
-    """Another count of scenarios or particles, NaN and speeds beyond the CFL bound are
-    errors.
-    """
-    solver = start(CONSTANTS, [ball(Material.LIQUID)])
-    good = ball(Material.LIQUID)
-    with pytest.raises(UsageError):
-        solver.load([good, good])
-    fewer_positions = good.position[:-1]
-    one_less = dataclasses.replace(good, position=fewer_positions)
-    with pytest.raises(UsageError) as caught:
-        solver.load([one_less])
-    assert caught.value.where == "scenario 0"
-    not_numbers = np.full_like(good.position, np.nan)
-    nowhere = dataclasses.replace(good, position=not_numbers)
-    high_speed = good.velocity + 100.0
-    fast = dataclasses.replace(good, velocity=high_speed)
-    for state in (nowhere, fast):
-        with pytest.raises(WorkFailedError):
-            solver.load([state])
-    body_force = np.ones((1, 1, 2))
-    forced = dataclasses.replace(good, body_force=body_force)
-    with pytest.raises(UsageError) as caught:
-        solver.load([forced])
-    assert caught.value.where == "scenario 0"
-
-
-@pytest.mark.parametrize(
-    "unused",
-    [
-        {"viscosity": 1e-3},
-        {"wall_velocity": np.full((4, 2), 0.1)},
-        {"wall_velocity": np.full((3, 4, 2), 0.1)},
-        {"wall_velocity": "slow"},
-    ],
-    ids=["viscosity", "walls", "program of walls", "text"],
-)
-def test_what_the_solver_does_not_read_is_refused(unused: dict[str, Any]) -> None:
-    """The state would state a motion, or a viscosity, that never acted."""
-    solver = start(CONSTANTS, [ball(Material.LIQUID)])
-    state = dataclasses.replace(ball(Material.LIQUID), **unused)
-    with pytest.raises(UsageError) as caught:
-        solver.load([state])
-    assert caught.value.where == "scenario 0"
 
 
 def test_courant_numbers_by_hand() -> None:

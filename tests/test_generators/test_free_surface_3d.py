@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from turns import of_this_turn
 
 from lagbench.data.registry import Size, load
-from lagbench.errors import WorkFailedError
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import free_surface_walls, solver_constants
 from lagbench.generators.constitutive import lame
@@ -27,7 +26,7 @@ from lagbench.generators.free_surface import FreeSurface, courant
 from lagbench.generators.free_surface_3d import FreeSurface3D
 from lagbench.generators.multimaterial import PAIRS
 from lagbench.generators.shapes import Body, body_at, sample_points
-from lagbench.generators.solids import Ball, Block, Rod, Solid, cube_root
+from lagbench.generators.solids import Ball, Block, Rod, Solid
 from lagbench.generators.solver import build
 from lagbench.generators.split import (
     Device,
@@ -352,54 +351,6 @@ def test_energy_of_a_stretched_body_by_hand() -> None:
     assert elastic == pytest.approx(expected, rel=2e-2)
 
 
-@pytest.mark.slow
-def test_friction_decelerates_by_mu_g() -> None:
-    """A block that slides over a rough floor, askew, loses mu g of speed in a second
-    along its way.
-    """
-    block = Block((0.2, 0.1, 0.2))
-    height = CONSTANTS["wall"] / CONSTANTS["grid"] + 0.05
-    velocity = (0.6, 0.0, 0.8)
-    way = np.array(velocity)
-    centre = (0.35, height, 0.3)
-    piece = Piece(Material.JELLY, block, centre, velocity)
-    state = pieces(piece)
-    speeds = []
-    for friction in (0.0, 0.2):
-        sliding = dataclasses.replace(state, friction=friction)
-        solver = start(sliding)
-        solver.advance(120)
-        velocities = solver.velocity()[0]
-        mean = velocities.mean(axis=0, dtype=np.float64)
-        speeds.append(float(mean @ way))
-    time = 120 * CONSTANTS["dt"]
-    without, braked = speeds
-    deceleration = (without - braked) / time
-    assert deceleration == pytest.approx(0.2 * 2.5, rel=0.15)
-
-
-@pytest.mark.slow
-def test_free_flight_is_a_parabola() -> None:
-    """A ball without spin moves by v t - g t (t + dt) / 2, as semi-implicit steps."""
-    ball = Ball(0.1)
-    rng = np.random.default_rng(0)
-    body = Body(ball, np.array((0.4, 0.6, 0.5)))
-    position = sample_points(rng, body, PARTICLES)
-    velocity = (0.5, 0.25, -0.25)
-    state = liquid(position, alike(velocity, PARTICLES), ball.measure)
-    solver = start(state)
-    substeps = 60
-    solver.advance(substeps)
-    dt = CONSTANTS["dt"]
-    time = substeps * dt
-    fall = 0.5 * CONSTANTS["gravity"] * time * (time + dt)
-    expected = np.array(velocity) * time
-    expected[1] -= fall
-    displacement = solver.position()[0] - position
-    moved = displacement.mean(axis=0)
-    assert moved == pytest.approx(expected, abs=2e-6)
-
-
 @functools.cache
 def compiled_in_the_plane(particle_count: int) -> FreeSurface:
     """Return a solver in two dimensions."""
@@ -564,39 +515,6 @@ def test_distances_of_solids() -> None:
     assert of_rod == pytest.approx([-0.2, 0.3, from_edge])
 
 
-def test_a_turned_rod_fits_its_bounding_box() -> None:
-    """Points of the surface reach the box and never leave it."""
-    direction = (2.0 / 3.0, -1.0 / 3.0, 2.0 / 3.0)
-    axis = np.array(direction)
-    rod = Rod(0.5, 0.1, direction)
-    angle = np.linspace(0.0, 2.0 * np.pi, 721)[:, None]
-    first = np.cross(axis, [0.0, 0.0, 1.0])
-    first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
-    circle = np.cos(angle) * first + np.sin(angle) * second
-    rim = 0.1 * circle
-    end = 0.25 * axis + rim
-    surface = np.concatenate([end, end - 0.5 * axis])
-    distance = np.abs(rod.distance(surface))
-    reach = np.abs(surface).max(axis=0)
-    assert distance.max() < 1e-12
-    assert reach == pytest.approx(rod.reach, rel=1e-4)
-
-
-def test_solids_of_a_volume() -> None:
-    """They have it, and a block the aspects asked for."""
-    block = Block.of_volume(0.01, (0.8, 1.25))
-    ball = Ball.of_volume(0.01)
-    x, y, z = block.sides
-    assert block.measure == pytest.approx(0.01, rel=1e-14)
-    assert x / y == pytest.approx(0.8)
-    assert z / y == pytest.approx(1.25)
-    assert ball.measure == pytest.approx(0.01, rel=1e-14)
-    values = np.geomspace(1e-6, 1e6, 200)
-    roots = [cube_root(float(value)) for value in values]
-    np.testing.assert_allclose(roots, np.cbrt(values), rtol=1e-15)
-
-
 @pytest.mark.parametrize("size_name", ["tiny", "mini"])
 def test_families_of_fluid_3d(size_name: str) -> None:
     """Families by id modulo 4; bodies lie in the box, a column stands on the floor
@@ -690,33 +608,3 @@ def test_dam_break_in_three_dimensions_follows_the_experiment() -> None:
     result = dam_break.run("mini", "fluid-3d")
     assert result.deviation <= 0.05
     assert (np.diff(result.front) > 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("scenario", "name", "length"),
-    [
-        (0, "ball_radius", 0.6),
-        (1, "block_side", 1.2),
-        (2, "column_width", 0.8),
-        (2, "column_height", 0.8),
-        (3, "pool_depth", 0.8),
-        (3, "pool_depth", 0.7),
-        (3, "drop_radius", 0.4),
-    ],
-)
-def test_a_body_of_liquid_without_room_is_refused(
-    scenario: int, name: str, length: float
-) -> None:
-    """It would be drawn across a wall, and its particles squeezed onto the wall.
-
-    The room between the walls is 0.75 wide. Above a pool of depth 0.7 no drop fits.
-    """
-    size = load().size("fluid-3d", "tiny")
-    parameters = dict(size.parameters)
-    for end in ("min", "max"):
-        key = f"{name}_{end}"
-        parameters[key] = parameters[key].model_copy(update={"value": length})
-    own_size = size.model_copy(update={"parameters": parameters})
-    with pytest.raises(WorkFailedError) as caught:
-        draw_initial_state(own_size, scenario)
-    assert f"scenario {scenario}" in str(caught.value.where)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -56,27 +55,4 @@ def test_a_program_that_is_none_is_refused(name: str, program: object) -> None:
     with pytest.raises(UsageError) as caught:
         solver.load([state])
     assert name in str(caught.value.where)
-    solver.close()
-
-
-def test_friction_is_refused() -> None:
-    """Walls of a full box hold the fluid or let it slide; none has friction."""
-    state = dataclasses.replace(mixed_state(), friction=0.1)
-    solver = FullBox(constants(MIXED_BOX, MIXED_COUNTS, force_layers=2))
-    with pytest.raises(UsageError) as caught:
-        solver.load([state])
-    assert caught.value.where == "scenario 0, friction"
-    solver.close()
-
-
-def test_positions_may_be_lists() -> None:
-    """As velocities may."""
-    state = mixed_state()
-    position: Any = state.position.tolist()
-    as_list = dataclasses.replace(state, position=position)
-    solver = FullBox(constants(MIXED_BOX, MIXED_COUNTS, force_layers=2))
-    solver.load([as_list])
-    positions = solver.position()[0]
-    solver.load([state])
-    np.testing.assert_array_equal(positions, solver.position()[0])
     solver.close()

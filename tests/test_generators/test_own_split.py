@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import Result
-from scenario_draws import changed
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
@@ -21,7 +20,6 @@ from lagbench.errors import (
 from lagbench.generators.batch import (
     SimulationJob,
     draw_initial_state,
-    start_frame,
 )
 from lagbench.generators.constants import solver_constants, split_module
 from lagbench.generators.simulate import simulate
@@ -77,69 +75,6 @@ def test_an_exception_of_initial_state_names_file_and_line(
     assert "Traceback" not in str(caught.value)
 
 
-@pytest.mark.parametrize("bound", ["float('nan')", "1e9"])
-def test_a_drawn_value_without_exact_form_names_file_and_line(
-    bound: str, package: Install
-) -> None:
-    """The fix names the user's file of ranges, not datasets.yaml of lagbench."""
-    change = f"uniform(rng, 0.2, {bound})"
-    size, module_file = own_size(package, WIDTH, change)
-    with pytest.raises(WorkFailedError) as caught:
-        draw_initial_state(size, 3)
-    where = str(caught.value.where)
-    assert line_of(module_file, change) in where
-    assert "scenario 3" in where
-    assert str(size.file) in str(caught.value.fix)
-
-
-@pytest.mark.parametrize(
-    ("split", "scenario", "values"),
-    [
-        ("fluid", 0, {"area_min": 1.5, "area_max": 1.6}),
-        ("fluid", 1, {"thrown_velocity_x_min": 90.0, "thrown_velocity_x_max": 99.0}),
-        ("multimaterial", 5, {"area_min": 0.45, "area_max": 0.45}),
-        ("cavity", 0, {"reynolds_min": 50.0, "reynolds_max": 20.0}),
-    ],
-    ids=["no room", "too fast", "no room side by side", "empty range"],
-)
-def test_a_value_that_cannot_be_drawn_names_the_file_of_the_split(
-    split: str, scenario: int, values: dict[str, float], tmp_path: Path
-) -> None:
-    """The generator is ours, but a file of the user describes the split."""
-    own_file = tmp_path / "mine.yaml"
-    size = changed(load().size(split, "tiny"), **values)
-    own_size = size.model_copy(update={"file": own_file})
-    with pytest.raises(WorkFailedError) as caught:
-        draw_initial_state(own_size, scenario)
-    where = str(caught.value.where)
-    assert str(own_file) in where
-    assert split in where
-    assert f"scenario {scenario}" in where
-    assert "datasets.yaml" not in str(caught.value)
-
-
-def test_a_missing_parameter_names_both_places(
-    package: Install,
-) -> None:
-    """The file that lacks it, and the line that asks for it."""
-    change = 'size.value("widht")'
-    size, module_file = own_size(package, WIDTH, change)
-    with pytest.raises(UnreadableFileError) as caught:
-        draw_initial_state(size, 3)
-    where = str(caught.value.where)
-    assert str(size.file) in where
-    assert line_of(module_file, change) in where
-
-
-def test_an_exception_of_solver_parameters_names_file_and_line(
-    package: Install,
-) -> None:
-    size, module_file = own_size(package, CONSTANTS, "no_constants")
-    with pytest.raises(WorkFailedError) as caught:
-        solver_constants(size)
-    assert caught.value.where == line_of(module_file, "no_constants")
-
-
 def test_a_module_that_fails_at_import_names_file_and_line(
     package: Install,
 ) -> None:
@@ -165,44 +100,6 @@ def test_constants_of_no_solver_are_refused(change: str, package: Install) -> No
     with pytest.raises(UsageError) as caught:
         solver_constants(size)
     assert caught.value.where == "mine.solver_parameters"
-
-
-def test_a_module_that_ends_the_program_is_refused(package: Install) -> None:
-    """Else a command would end without a word and without data."""
-    size, module_file = own_size(package, "GAP = 0.01", "raise SystemExit(0)")
-    with pytest.raises(UsageError) as caught:
-        split_module(size)
-    assert line_of(module_file, "raise SystemExit(0)") in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "use"),
-    [(WIDTH, draw_initial_state), (CONSTANTS, lambda size, _: solver_constants(size))],
-    ids=["initial_state", "solver_parameters"],
-)
-def test_a_function_that_ends_the_program_is_refused(
-    old: str, use: Callable[[Size, int], object], package: Install
-) -> None:
-    change = "exit(0)"
-    size, module_file = own_size(package, old, change)
-    with pytest.raises(WorkFailedError) as caught:
-        use(size, 3)
-    assert caught.value.where == line_of(module_file, change)
-
-
-def test_a_start_before_the_first_substep_is_refused(package: Install) -> None:
-    """Its first frames would all show the same state."""
-    both = (
-        "def start_frame(size, scenario, rng):\n    return -5\n\n\ndef initial_state("
-    )
-    size, module_file = own_size(package, "def initial_state(", both)
-    text = module_file.read_text()
-    area = "area=width * height"
-    module_file.write_text(text.replace(area, f"{area}, start_frame=-5"))
-    for use in (start_frame, draw_initial_state):
-        with pytest.raises(UsageError) as caught:
-            use(size, 3)
-        assert str(caught.value.where).startswith("mine.start_frame")
 
 
 @pytest.mark.slow

@@ -156,21 +156,6 @@ def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
     assert value == pytest.approx(expected, abs=1e-13)
 
 
-def test_ramp_joins_one_with_two_derivatives() -> None:
-    """Bridson's ramp: 0 with slope 15/8 at 0; 1 with slope and curvature 0 from 1
-    on.
-    """
-    t = np.array([0.0, 1.0 - 1e-9, 1.0, 7.0])
-    position = np.stack([t, np.zeros(4)], axis=1)
-    along_x, _ = noise.coordinates(position)
-    ramp = noise.ramp(along_x)
-    value = [0.0, 1.0, 1.0, 1.0]
-    slope = [1.875, 0.0, 0.0, 0.0]
-    assert_allclose(ramp.value, value, atol=1e-15)
-    assert_allclose(ramp.x, slope, atol=1e-15)
-    assert_allclose(ramp.xx, np.zeros(4), atol=1e-7)
-
-
 @pytest.mark.parametrize("frequency", [1, 2, 4, 13])
 def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
     frequency: int,
@@ -189,26 +174,6 @@ def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
             rise = above - below
             slopes.append(rise / (2 * step))
         assert_allclose(term, slopes, atol=2e-9 * frequency)
-
-
-@pytest.mark.parametrize("frequency", [1, 4, 13])
-def test_hessian_by_numerical_differentiation(frequency: int) -> None:
-    """The second derivatives are the differences of the first."""
-    lattice = lattice_of(frequency)
-    step = 1e-6
-    position = points(200, LOW + 0.001, HIGH - 0.001)
-    here = stream(position, lattice)
-    tolerance = 2e-5 * frequency**2
-    along_axes = [(here.xx, here.xy), (here.xy, here.yy)]
-    steps = step * np.eye(2)
-    for axis, offset in enumerate(steps):
-        along_x, along_y = along_axes[axis]
-        after = stream(position + offset, lattice)
-        before = stream(position - offset, lattice)
-        slope_x = (after.x - before.x) / (2 * step)
-        slope_y = (after.y - before.y) / (2 * step)
-        assert_allclose(along_x, slope_x, atol=tolerance)
-        assert_allclose(along_y, slope_y, atol=tolerance)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])

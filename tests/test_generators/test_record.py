@@ -17,7 +17,6 @@ from conftest import SIZE, SPLIT
 
 from lagbench.data.manifest import Manifest, read_manifest, write_manifest
 from lagbench.data.registry import default_path, load
-from lagbench.errors import DataError
 from lagbench.generators.record import (
     main,
     measured_values,
@@ -191,63 +190,6 @@ def test_changed_bits_need_another_version(
         released_name(size.model_copy(update={"version": "3.0.0"}))
         == f"{SPLIT}/{SIZE}/v3"
     )
-
-
-def test_a_new_major_version_is_recorded_in_place_of_the_old_one(
-    copied: Callable[[], Path],
-    registry: Path,
-    generated: GenerationResult,
-) -> None:
-    """Nothing is allowed that the version does not tell."""
-    assert run(generated.root, registry) == 0
-    text = registry.read_text()
-    old_version = load(registry).size(SPLIT, SIZE).version
-    place = f"      {SIZE}:\n        version: "
-    assert text.count(f"{place}{old_version}") == 1
-    registry.write_text(text.replace(f"{place}{old_version}", f"{place}3.0.0"))
-
-    root = copied()
-    folder = root / SPLIT / SIZE
-    (folder / "v2").rename(folder / "v3")
-    path = folder / "v3" / "manifest.json"
-    content = json.loads(path.read_text())
-    new_hash = "3" * 64
-    content |= {"version": "3.0.0", "dataset_sha256": new_hash}
-    path.write_text(json.dumps(content))
-    assert run(root, registry) == 0
-    released = json.loads((registry.parent / "released.json").read_text())
-    assert released == {
-        f"{SPLIT}/{SIZE}/v2": generated.dataset_sha256,
-        f"{SPLIT}/{SIZE}/v3": new_hash,
-    }
-
-
-def test_incomplete_or_changed_data_are_not_recorded(
-    copied: Callable[[], Path],
-    registry: Path,
-    generated: GenerationResult,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """A file that is not the manifest's, no manifest, or a part of a data set: exit
-    code 4.
-    """
-    root = copied()
-    folder = root / SPLIT / SIZE / "v2"
-    (folder / "test" / "0003.nc").write_bytes(b"other")
-    assert run(root, registry) == 4
-    assert "0003.nc" in capsys.readouterr().err
-    (folder / "manifest.json").unlink()
-    assert run(root, registry) == 4
-    assert "no manifest" in capsys.readouterr().err
-    # Statistics need every scenario, the predictability limit every perturbed run.
-    manifest = manifest_of(generated.root)
-    without_perturbed_run = [
-        entry.model_copy(update={"twin_floor": ()}) for entry in manifest.files
-    ]
-    for part in ({"complete": False}, {"files": tuple(without_perturbed_run)}):
-        with pytest.raises(DataError) as caught:
-            measured_values(manifest.model_copy(update=part))
-        assert caught.value.where == "curl-noise tiny"
 
 
 def test_no_released_hash_has_changed() -> None:

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scenario_draws import neighbours
 
-from lagbench.errors import WorkFailedError
-from lagbench.generators import draws, shapes, solids
+from lagbench.generators import draws, shapes
 
 # Three overlapping unit discs in a row, and one that touches them from above.
 ROW = np.array(
@@ -74,29 +73,6 @@ def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
     assert_allclose(outer_distance, gaps[:, 0], atol=1.5 * cell)
 
 
-def test_shapes_by_hand() -> None:
-    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner
-    (3-4-5); one blob.
-    """
-    rectangle = shapes.Rectangle(4.0, 2.0)
-    at = np.array(
-        [
-            [0.0, 0.0],
-            [3.0, 0.5],
-            [5.0, 5.0],
-            [1.5, 0.0],
-        ]
-    )
-    distance = rectangle.distance(at)
-    assert distance.tolist() == [-1.0, 1.0, 5.0, -0.5]
-    # The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi).
-    one_centre = np.zeros((1, 2))
-    blob = shapes.Blobs.of_area(0.05, one_centre, cells=512)
-    radius = math.sqrt(0.05 / math.pi)
-    assert blob.radius == pytest.approx(radius, rel=1e-3)
-    assert blob.centres == ((0.0, 0.0),)
-
-
 @pytest.mark.parametrize("count", [97, 625, 2500])
 @pytest.mark.parametrize("name", SHAPES)
 def test_sample_points_lie_evenly_inside(name: str, count: int) -> None:
@@ -150,31 +126,3 @@ def test_place_keeps_within_its_region(scenario: int, name: str) -> None:
         reach = body.shape.reach[axis]
         assert low - quantum <= centre - reach
         assert centre + reach <= high + quantum
-
-
-def test_place_refuses_a_body_that_does_not_fit() -> None:
-    """The error says how wide the body is and what to change."""
-    narrow = ((0.1, 0.3), (0.0, 1.0))
-    stream = source()
-    with pytest.raises(WorkFailedError):
-        shapes.place(stream, SHAPES["rectangle"], narrow)
-
-
-@pytest.mark.parametrize(
-    "shape",
-    [
-        shapes.Rectangle(0.5, 0.0),
-        shapes.Rectangle(0.5, 1e-12),
-        shapes.Rectangle(-0.5, -0.5),
-        shapes.Rectangle(math.nan, 0.1),
-        shapes.Rectangle(math.inf, 0.1),
-        shapes.Disc(math.nan),
-        solids.Ball(math.nan),
-    ],
-    ids=str,
-)
-def test_a_body_without_room_for_particles_is_refused(shape: shapes.Shape) -> None:
-    """The search for points inside it would not end."""
-    body = shapes.Body(shape, np.full(len(shape.reach), 0.5))
-    with pytest.raises(WorkFailedError):
-        shapes.sample_points(source(), body, 3)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -65,22 +63,6 @@ def test_snow_is_counted_where_its_hardening_meets_a_cap(split: str, size: str) 
     assert 0 < expected < COUNT
     snow = summary(p, Material.SNOW, least, greatest)
     assert snow.clamped_particles == expected
-
-
-@pytest.mark.parametrize("material", [Material.LIQUID, Material.SNOW])
-def test_snow_may_be_without_hardening(material: Material) -> None:
-    """The factor is then 1 for every Jp, and meets no cap."""
-    hardened = constants("multimaterial", "tiny")
-    p = dataclasses.replace(hardened, snow_hardening=0.0)
-    jp = np.array([0.5, 1.0, 1.4], np.float32)
-    assert jp.min() > max(p.snow_jp_min, p.jacobian_min)
-    assert summary(p, material, jp, jp).clamped_particles == 0
-
-
-def test_a_steep_hardening_does_not_overflow() -> None:
-    p = dataclasses.replace(constants("multimaterial", "tiny"), snow_hardening=1e4)
-    jp = np.array([0.5, 1.0, 1.4], np.float32)
-    assert summary(p, Material.SNOW, jp, jp).clamped_particles == 2
 
 
 def test_a_compressed_liquid_is_counted() -> None:

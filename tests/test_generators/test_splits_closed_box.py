@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,9 +21,7 @@ from scenario_draws import (
 from scipy.interpolate import CubicHermiteSpline
 
 from lagbench.data import WALLS, registry
-from lagbench.errors import UsageError
 from lagbench.generators import draws
-from lagbench.generators.cavity import is_classic
 from lagbench.generators.split import InitialState
 
 
@@ -162,45 +159,6 @@ def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
             assert len(distinct_speeds) == len(knots)
 
 
-@pytest.mark.parametrize(
-    ("size", "expected"),
-    [
-        ("full", 9),
-        ("mini", 6),
-    ],
-)
-def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
-    """There the lid rests, then keeps a speed, at the latest in the last given frame;
-    train has all walls.
-    """
-    tier = registry.load().size("cavity", size)
-    states = all_of("cavity", size)
-    classic = {}
-    for i, state in zip(usual_ids(tier), states, strict=True):
-        has_constant_speed = state.parameters["motion"] == "constant"
-        assert is_classic(i) == has_constant_speed
-        if has_constant_speed:
-            classic[i] = state
-    assert len(classic) == expected
-    for state in classic.values():
-        speed = np.abs(state.wall_velocity).max(axis=2)
-        starts = np.argmax(speed > 0.0, axis=0)
-        is_moving = speed.any(axis=0)
-        for wall in np.flatnonzero(is_moving):
-            start = starts[wall]
-            assert state.start_frame - 15 <= start <= state.start_frame + 5
-            last_speed = speed[-1, wall]
-            np.testing.assert_array_equal(speed[start:, wall], last_speed)
-            speed_max = tier.value("speed_max")
-            assert 0.5 * speed_max <= last_speed <= speed_max
-    if size == "full":
-        train: Counter[object] = Counter()
-        for i, state in classic.items():
-            if i < 48:
-                train[state.parameters["wall"]] += 1
-        assert sorted(train.values()) == [1] * 6
-
-
 @given(
     count=st.integers(4, 3000),
     scenario=st.integers(0, 2**30),
@@ -248,21 +206,6 @@ def test_curl_noise_frequencies_follow_the_thesis(
     assert frequencies == [i % count + least for i in ids]
 
 
-def test_curl_noise_scales() -> None:
-    """At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has
-    one scale.
-    """
-    drawn = [state.parameters for state in all_of("curl-noise", "mini")]
-    for frequency in (2, 3, 4):
-        vorticities = []
-        for parameters in drawn:
-            if parameters["frequency"] == frequency:
-                vorticities.append(float(parameters["initial_vorticity_rms"]))
-        assert 0.08 < 0.1 * np.mean(vorticities) < 0.12
-    for state in all_of("curl-noise"):
-        assert state.parameters["scale"] == 0.0052
-
-
 def test_curl_noise_affine_predicts_the_neighbours_velocity() -> None:
     """v(x_q) = v_p + C (x_q - x_p) with C midway: 2 % of the change is left; C has no
     trace, to the bit.
@@ -286,26 +229,6 @@ def test_curl_noise_affine_predicts_the_neighbours_velocity() -> None:
     assert residual_rms < 0.02 * change_rms
 
 
-def test_curl_noise_energy_grows_with_frequency() -> None:
-    """One velocity scale for all: energy goes about as frequency squared."""
-    states = all_of("curl-noise")
-    recorded = []
-    for state in states:
-        recorded.append(float(state.parameters["initial_kinetic_energy"]))
-    for number, state in enumerate(states[:10]):
-        square_speed = np.sum(state.velocity**2, axis=1)
-        expected = 0.5 * np.mean(square_speed)
-        assert recorded[number] == pytest.approx(expected, rel=1e-12)
-
-    by_frequency = np.reshape(recorded[:70], (7, 10)).T
-    mean = by_frequency.mean(axis=1)
-    assert np.all(np.diff(mean) > 0)
-    frequency = np.arange(4, 14)
-    log_frequency = np.log(frequency)
-    slope, _ = np.polyfit(log_frequency, np.log(mean), 1)
-    assert 1.6 < slope < 2.4
-
-
 def test_curl_noise_divergence_is_the_grids_share_alone() -> None:
     """Second-order differences: cells a third as wide show a ninth of the
     divergence.
@@ -321,12 +244,3 @@ def test_curl_noise_divergence_is_the_grids_share_alone() -> None:
     ratio = coarse_divergence / fine_divergence
     assert ratio == pytest.approx(9.0, rel=0.15)
     assert coarse_divergence < 0.03 * vorticity
-
-
-def test_curl_noise_refuses_a_lattice_of_another_count() -> None:
-    """A lattice that does not hold the particles is a mistake in datasets.yaml."""
-    tiny = registry.load().size("curl-noise", "tiny")
-    size = changed(tiny, lattice_x=20)
-    with pytest.raises(UsageError) as caught:
-        draw(size, 0)
-    assert caught.value.where == "datasets.yaml, curl-noise tiny"

@@ -69,20 +69,6 @@ def test_all_hashes_are_compared(
         assert caught.value.exit_code == 4
 
 
-def test_equal_hashes_give_the_verdict_equal(
-    copied: Copy, unmeasured: Registry, right: Measured
-) -> None:
-    """All hashes agree with datasets.yaml, and nothing is simulated."""
-    result = generate(
-        SPLIT,
-        SIZE,
-        root=copied(),
-        registry=with_measured(unmeasured, right),
-    )
-    assert result.verdict == "equal to datasets.yaml"
-    assert result.simulated == ()
-
-
 @pytest.mark.slow
 def test_a_forged_file_is_simulated_again(
     copied: Copy, unmeasured: Registry, generated: GenerationResult

@@ -30,7 +30,6 @@ from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.generators.batch import (
     draw_initial_state,
-    start_frame,
     substep_count,
 )
 from lagbench.generators.draws import generator
@@ -456,18 +455,6 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert set(select(size)) == everything
 
 
-@pytest.mark.slow
-def test_files_in_three_dimensions_are_estimated_without_velocities(
-    unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
-) -> None:
-    """The estimate is an upper bound of the files that are generated, not by much."""
-    size = unmeasured.size("cavity-3d", "tiny")
-    root = tiny_split("cavity-3d").root
-    for scenario in size.scenarios:
-        file_bytes = size.path(root, scenario).stat().st_size
-        assert file_bytes < size.file_bytes(scenario) < 1.5 * file_bytes
-
-
 def test_estimates_add_up(unmeasured: Registry) -> None:
     """Bytes follow from frames and particles; time from substeps, never below the
     longest scenario's.
@@ -483,15 +470,6 @@ def test_estimates_add_up(unmeasured: Registry) -> None:
     assert one == pytest.approx(2 * two)
     assert estimate(size, ()).seconds(1) == 0.0
     assert expected.seconds(9) == expected.seconds(2)
-
-
-@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
-@pytest.mark.parametrize("tier", ["tiny", "mini"])
-def test_the_first_frame_is_that_of_the_whole_draw(split: str, tier: str) -> None:
-    size = load().size(split, tier)
-    for scenario in size.scenarios[:8]:
-        state = draw_initial_state(size, scenario)
-        assert start_frame(size, scenario) == state.start_frame
 
 
 @pytest.mark.slow

@@ -19,8 +19,8 @@ import pytest
 from conftest import SIZE, SPLIT
 
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import Manifest, read_manifest, write_manifest
-from lagbench.data.registry import Registry, load
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Registry
 from lagbench.errors import WorkFailedError
 from lagbench.make.generate import GenerationResult, generate
 
@@ -237,59 +237,3 @@ def test_a_killed_parent_is_resumed(
     assert found is not None
     assert whole is not None
     assert found.files == whole.files  # with what each simulation went through
-
-
-@pytest.mark.slow
-def test_the_order_of_periodic_axes_makes_no_other_scenario(
-    tmp_path: Path, unmeasured_path: Path
-) -> None:
-    """A description may name them in any order; what is there is kept."""
-    before, name, after = unmeasured_path.read_text().partition("  decaying-vortices:")
-    own = tmp_path / "own.yaml"
-    own.write_text(before + name + after.replace("[x, y]", "[y, x]"))
-    registry = load(own)
-    options: dict[str, Any] = {"scenarios": "0", "root": tmp_path / "data"}
-    generate("decaying-vortices", "tiny", registry=registry, **options)
-    again = generate("decaying-vortices", "tiny", registry=registry, **options)
-    assert again.kept == (0,)
-    assert again.simulated == ()
-
-
-def without_a_name(rows: dict[str, tuple[float, ...]]) -> None:
-    """Leave out a deviation."""
-    del rows["velocity_std"]
-
-
-def without_an_axis(rows: dict[str, tuple[float, ...]]) -> None:
-    """Shorten a mean."""
-    rows["velocity_mean"] = rows["velocity_mean"][:1]
-
-
-def with_an_axis(rows: dict[str, tuple[float, ...]]) -> None:
-    """Lengthen a mean."""
-    rows["velocity_mean"] = (*rows["velocity_mean"], 0.0)
-
-
-def with_a_name(rows: dict[str, tuple[float, ...]]) -> None:
-    """Add a quantity that no data set has."""
-    rows["colour_mean"] = (0.0,)
-
-
-@pytest.mark.parametrize(
-    "change", [without_a_name, without_an_axis, with_an_axis, with_a_name]
-)
-def test_statistics_that_cannot_be_those_of_train_are_made_anew(
-    change: Callable[[dict[str, tuple[float, ...]]], None],
-    generated: GenerationResult,
-    unmeasured: Registry,
-    tmp_path: Path,
-) -> None:
-    """A manifest may come from anybody. No hash in datasets.yaml contradicts it."""
-    shutil.copytree(generated.root, tmp_path, dirs_exist_ok=True)
-    manifest = manifest_of(tmp_path)
-    rows = dict(manifest.statistics)
-    change(rows)
-    write_manifest(tmp_path, manifest.model_copy(update={"statistics": rows}))
-    result = generate(SPLIT, SIZE, root=tmp_path, registry=unmeasured)
-    assert result.simulated == ()
-    assert manifest_of(tmp_path).statistics == manifest.statistics

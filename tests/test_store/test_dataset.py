@@ -17,9 +17,8 @@ from scenario_factory import PARAMETERS, frames_of, make_key, write_scenario
 import lagbench
 from lagbench.data import registry
 from lagbench.data.manifest import build_manifest, write_manifest
-from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, LagbenchError
-from lagbench.store.dataset import list_splits, load_manifest, open_split
+from lagbench.store.dataset import load_manifest, open_split
 
 TEST_IDS = registry.load().size("cavity", "tiny").subsets["test"]
 
@@ -92,19 +91,6 @@ def test_ragged_scenarios_are_padded(ragged: Path) -> None:
 def test_types_survive_the_padding(ragged: Path, name: str, dtype: str) -> None:
     with open_tiny(ragged) as data:
         assert str(data[name].dtype) == dtype
-
-
-def test_the_default_root_is_that_of_the_environment(
-    ragged: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Attributes name the data set, and have no hash of a single scenario."""
-    monkeypatch.setenv("LAGBENCH_ROOT", str(ragged))
-    with open_split("cavity", size="tiny") as data:
-        assert data.attrs["split"] == "cavity"
-        assert data.attrs["size"] == "tiny"
-        assert data.attrs["subset"] == "test"
-        assert "content_sha256" not in data.attrs
-        assert "content_sha256" not in data["position"].attrs
 
 
 def test_the_given_viscosity_is_a_coordinate(tmp_path: Path) -> None:
@@ -222,24 +208,6 @@ def test_nothing_stays_open_after_an_error(ragged: Path) -> None:
     assert list_open_files(ragged) == []
 
 
-def test_a_split_left_open_spoils_nothing(ragged: Path, tmp_path: Path) -> None:
-    """Files open elsewhere are checked and, after another file was written, opened
-    again.
-    """
-    data = open_tiny(ragged)
-    paths = sorted(ragged.rglob("*.nc"))
-    for path in paths:
-        check_scenario(path)
-    with netCDF4.Dataset(tmp_path / "other.nc", "w") as other:
-        other.createDimension("n", 3)
-        other.createVariable("x", "f4", ("n",))
-        for path in paths:
-            with read_scenario(path) as file:
-                space = file.read("space")
-                assert space.tolist() == ["x", "y"]
-    data.close()
-
-
 def test_load_manifest_reads_what_was_written(tmp_path: Path) -> None:
     manifest = build_manifest(
         None,
@@ -253,11 +221,6 @@ def test_load_manifest_reads_what_was_written(tmp_path: Path) -> None:
     write_manifest(tmp_path, manifest)
     again = load_manifest("cavity", size="tiny", root=tmp_path)
     assert again == manifest
-
-
-def test_all_splits_are_listed() -> None:
-    splits = {"cavity", "curl-noise", "fluid", "multimaterial"}
-    assert splits <= set(list_splits())
 
 
 def test_public_names_load_on_first_use() -> None:
@@ -295,27 +258,3 @@ def test_a_subset_that_is_kept_open_is_opened_again(ragged: Path) -> None:
     )
     assert run.returncode == 0, run.stderr[-2000:]
     assert run.stdout.strip() == "done"
-
-
-def test_public_modules_need_no_import_of_their_own() -> None:
-    """The docs write ``lagbench.exchange.export`` and ``lagbench.metrics.differ``."""
-    program = (
-        "import lagbench; "
-        "print(lagbench.exchange.export.__name__, lagbench.metrics.differ.__name__)"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert run.stdout.split() == ["export", "differ"]
-
-
-def test_without_pytorch_the_message_says_what_to_install() -> None:
-    program = (
-        "import sys; sys.modules['torch'] = None; import lagbench\n"
-        "try: lagbench.torch\n"
-        "except lagbench.errors.UsageError as error: print(error)"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert "pip install 'lagbench[baselines]'" in run.stdout

@@ -163,12 +163,6 @@ def test_only_right_data_are_packed(
     assert not list(output.glob("*"))
 
 
-def test_an_archive_is_read_through_fsspec(server: Mirror, here: Path) -> None:
-    url = server.folder.as_uri()
-    assert fetch_own(url, here).complete
-    assert is_right(here)
-
-
 def test_a_manifest_comes_before_an_archive(original: LocalSplit, here: Path) -> None:
     """From a store that has files, no archive is requested."""
     with serving(original.folder.parent) as running:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import pickle
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import SIZE, SPLIT
 from numpy.testing import assert_array_equal
 from scenario_factory import frames_of, make_key, write_scenario
 from torch.utils.data import DataLoader
@@ -192,25 +190,6 @@ def test_windows_have_the_first_frame_on_request(train: Open) -> None:
         assert torch.equal(window.position, expected)
 
 
-def test_batches_put_first_frames_side_by_side(train: Open) -> None:
-    """All windows of a batch need one."""
-    with_origin = train(origin=True)
-    batch = batch_of(with_origin, 3, 40)
-    of_second = batch.origin[PARTICLES[0] :]
-    assert of_second.equal(with_origin[40].origin)
-    without_origin = train()[40]
-    with pytest.raises(UsageError):
-        collate([with_origin[3], without_origin])
-
-
-def test_windows_of_several_subsets_follow_each_other(train: Open) -> None:
-    data = train(subset=["test", "train"])
-    assert len(data) == WINDOWS + 2 * 20
-    assert data.place(0) == (4, 0)
-    assert data.place(40) == (0, 0)
-    assert data.place(-1) == (2, 24)
-
-
 def test_a_window_has_materials_and_velocities_of_walls(train: Open) -> None:
     """The velocities of the walls are those of its own frames."""
     data = train(history=2, future=0)
@@ -298,31 +277,6 @@ def test_the_task_gives_the_default_history(location: Location) -> None:
     assert data.viscosity is None
 
 
-def test_gravity_and_viscosity_are_those_of_all_scenarios(
-    tmp_path: Path, unmeasured: Registry
-) -> None:
-    size = unmeasured.size("fluid", "tiny")
-    for scenario in size.subsets["valid"]:
-        key = make_key(
-            scenario,
-            subset="valid",
-            split="fluid",
-            version=size.version,
-        )
-        frame_count = size.frame_count(scenario)
-        write_scenario(tmp_path, key, frames=frame_count, walls=False)
-    data = lagbench.windows(
-        "fluid",
-        subset="valid",
-        size="tiny",
-        root=tmp_path,
-        registry=unmeasured,
-    )
-    assert data.history == 2
-    assert data.gravity == 2.5
-    assert data.viscosity == size.value("liquid_viscosity")
-
-
 def write_viscous(
     folder: Path,
     registry: Registry,
@@ -394,28 +348,6 @@ def test_windows_have_the_viscosity_of_the_data_set_where_files_state_none(
     assert task.effective_viscosity is not None
     assert data.viscosity == task.effective_viscosity
     assert data[0].viscosity == task.effective_viscosity
-
-
-def test_parameters_that_no_hash_covers_are_not_read(
-    generated: GenerationResult, tmp_path: Path
-) -> None:
-    """Anybody can add an attribute to a file, and its content hash stays."""
-    root = tmp_path / "data"
-    shutil.copytree(generated.root, root)
-    size = load().size(SPLIT, SIZE)
-    expected = lagbench.windows(SPLIT, size=SIZE, subset="test", root=root)[0]
-    for scenario in size.subsets["test"]:
-        with h5py.File(size.path(root, scenario), "r+") as file:
-            file.attrs["obstacle_x"] = 0.5
-            file.attrs["obstacle_y"] = 0.5
-            file.attrs["obstacle_diameter"] = 0.2
-            file.attrs["viscosity"] = 0.125
-    window = lagbench.windows(SPLIT, size=SIZE, subset="test", root=root)[0]
-    assert window.obstacle is None
-    assert window.viscosity == expected.viscosity
-    with lagbench.open_split(SPLIT, subset="test", size=SIZE, root=root) as data:
-        assert "obstacle" not in data.coords
-        assert set(data.viscosity.values) == {expected.viscosity}
 
 
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
@@ -597,18 +529,6 @@ def test_ranks_share_out_one_order(train: Open) -> None:
         assert list(sampler) == of_rank[:share]
 
 
-def test_a_sampler_asks_torch_for_its_rank(
-    train: Open, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = train()
-    second_of_three = WindowSampler(data, seed=1, rank=1, ranks=3)
-    expected = list(second_of_three)
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 3)
-    assert list(WindowSampler(data, seed=1)) == expected
-
-
 def test_one_rank_draws_what_two_ranks_have_left(train: Open) -> None:
     data = train()
     alone = WindowSampler(data, seed=1)
@@ -719,13 +639,6 @@ def test_whole_scenarios_lie_side_by_side(paths_of_test: Paths) -> None:
         assert_array_equal(position.numpy(), expected)
 
 
-def test_a_whole_scenario_has_all_frames_by_default(paths_of_test: Paths) -> None:
-    path = paths_of_test[4]
-    assert scenario_batch(path).frames == 26
-    last_two = scenario_batch(path, slice(-2, None))
-    assert last_two.frame.tolist() == [24]
-
-
 def write_train(root: Path) -> Path:
     """Write the scenarios of train and return their folder."""
     for scenario, frame_count in FRAMES.items():
@@ -748,20 +661,6 @@ def test_a_scenario_of_another_length_is_refused(tmp_path: Path, train: Open) ->
     one_more = FRAMES[1] + 1
     write_scenario(tmp_path, key, frames=one_more)
     assert_data_error(train(tmp_path), 40, "not that of the registry")
-
-
-def test_a_scenario_under_another_id_is_refused(tmp_path: Path, train: Open) -> None:
-    """Its own file can be read as soon as it is back."""
-    folder = write_train(tmp_path)
-    path = folder / "0002.nc"
-    content = path.read_bytes()
-    other_content = (folder / "0000.nc").read_bytes()
-    path.write_bytes(other_content)
-    data = train(tmp_path)
-    assert_data_error(data, 60, "not that of the registry")
-    path.unlink()
-    path.write_bytes(content)
-    assert isinstance(data[60], Window)
 
 
 def test_a_scenario_of_another_hash_is_refused(
@@ -933,13 +832,3 @@ def test_predictions_are_rollouts_of_the_task(
         prediction = predictions[scenario]
         assert prediction.dtype == np.float32
         assert_array_equal(prediction, expected)
-
-
-@pytest.mark.parametrize("history", [0, 7])
-def test_predictions_start_from_the_input_frames_of_the_task(
-    location: Location, history: int
-) -> None:
-    predictions = predict(extrapolate, "cavity", history=history, **location)
-    with pytest.raises(UsageError) as caught:
-        next(predictions)
-    assert caught.value.where == "predict"
