@@ -468,11 +468,12 @@ def test_noise_is_in_the_scales_and_in_the_target() -> None:
 
 
 OPERATORS = ["gns", "supergat", "gat", "gatv2", "pointnet", "transformer"]
+NETWORKS = [*OPERATORS, "egnn", "painn", "segnn", "upt", "corgi"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", of_this_turn(OPERATORS, turns=3))
-def test_every_operator_learns_a_swirl(name: str) -> None:
+@pytest.mark.parametrize("name", of_this_turn(NETWORKS, turns=3))
+def test_every_network_learns_a_swirl(name: str) -> None:
     """After forty steps a rollout is better than constant velocity in every frame.
 
     Constant velocity is better than standing still.
