@@ -101,38 +101,15 @@ def mirror_matrices(symmetry: Symmetry, dimension: int = 2) -> Tensor:
 
     Their shape is [image, axis, axis].
     """
-    if dimension == 3:
-        return _solid_matrices(symmetry)
-    identity = (1.0, 1.0)
-    flip_x = (-1.0, 1.0)
-    flip_y = (1.0, -1.0)
-    flip_both = (-1.0, -1.0)
-    diagonals = torch.tensor([identity, flip_x, flip_y, flip_both])
-    upright = torch.diag_embed(diagonals)
-
-    if symmetry is Symmetry.SQUARE:
-        swapped = upright.flip(2)
-        return torch.cat([upright, swapped])
-    if symmetry is Symmetry.MIRROR:
-        return upright[:2]
-    return upright[:1]
-
-
-def _solid_matrices(symmetry: Symmetry) -> Tensor:
-    """Return the matrices of all mirror images in three dimensions."""
-    diagonals = itertools.product((1.0, -1.0), repeat=3)
-    signs = torch.tensor(list(diagonals))
+    last_axis_first = itertools.product((1.0, -1.0), repeat=dimension)
+    signs = torch.tensor(list(last_axis_first)).flip(1)
     upright = torch.diag_embed(signs)
     if symmetry is Symmetry.NONE:
         return upright[:1]
     if symmetry is Symmetry.MIRROR:
-        keeps_y = signs[:, 1] > 0.0
-        return upright[keeps_y]
-    images = []
-    for order in itertools.permutations(range(3)):
-        permuted = upright[:, :, list(order)]
-        images.append(permuted)
-    return torch.cat(images)
+        return upright[signs[:, 1] > 0.0]
+    orders = itertools.permutations(range(dimension))
+    return torch.cat([upright[:, :, list(order)] for order in orders])
 
 
 def mirror_field(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> Tensor:

@@ -9,12 +9,11 @@ network with that operator.
 from __future__ import annotations
 
 import inspect
-import warnings
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-from lagbench.data.registry import PluginWarning, list_entry_points
+from lagbench.data.registry import list_entry_points
 from lagbench.errors import UsageError, suggest_name
 
 from .baseline import Baseline
@@ -51,18 +50,6 @@ def find(name: str) -> CatalogueEntry:
     if name not in points:
         raise UsageError(f"no baseline {name!r}; {suggest_name(name, points)}")
     return _load_entry(points[name])
-
-
-def load_all() -> dict[str, CatalogueEntry]:
-    """Return every baseline that can be loaded; warn of others with PluginWarning."""
-    entries = {}
-    for name, point in _find_points().items():
-        try:
-            entries[name] = _load_entry(point)
-        except Exception as error:  # importing a stranger's module may raise anything
-            message = f"{point.value} adds no baseline {name!r}: {error!r}"
-            warnings.warn(message, PluginWarning, stacklevel=2)
-    return entries
 
 
 def _find_points() -> dict[str, EntryPoint]:

@@ -172,35 +172,60 @@ class NeuralMPM(Baseline):
 
         Where they are few, the first velocity repeats. With ``average=False``, as in
         training, nothing is mirror-averaged, whatever the options say.
+
+        Raises:
+            DataError: viscosity or force are to be seen, and are not known.
         """
+        options = self.options
+        last_frame = given.frames - 1
         position = given.position[:, -self.history :]
         position = self.box.inside(position)
         layer = self.encoder.layers(given.material, given.sample)
+
+        # What drives the flow, from the last frame on.
+        dimension = position.shape[2]
+        walls = position.new_zeros(given.windows, 1, 2 * dimension, dimension)
+        if options.wall_velocity and given.wall_velocity is not None:
+            per_second = given.wall_velocity[:, last_frame:]
+            walls = per_second * self.info.frame_interval
+        force = None
+        if options.body_force:
+            force = require_force(given, self.info)[:, last_frame:]
+
+        viscosity = position.new_zeros(given.windows, 0)
+        if options.viscosity:
+            if given.viscosity is None:
+                raise DataError(
+                    "the viscosity is not known; train without it: --set "
+                    "model.viscosity=false",
+                    where=f"{self.info.split} {self.info.size}",
+                )
+            known_viscosity = given.viscosity.clamp(min=LEAST_VISCOSITY)
+            viscosity = torch.log(known_viscosity / VISCOSITY_UNIT)[:, None]
+        rest_shape = None
+        if options.strain:
+            rest_shape = RestShape.build(
+                self.grid,
+                first_frame(given),
+                layer,
+                given.windows * len(options.materials),
+                is_solid=given.material != LIQUID,
+            )
         state = GridState(
             position=position[:, -1],
-            velocity=last_velocities(position, self.options.velocities, self.box),
+            velocity=last_velocities(position, options.velocities, self.box),
             sample=given.sample,
             layer=layer,
-            walls=self._coming_walls(given),
+            walls=walls,
             context=position.new_zeros(given.windows, 0),
-            viscosity=self._scaled_viscosity(given),
-            body_force=self._coming_force(given),
-            rest_shape=self._rest_shape(given, layer),
+            viscosity=viscosity,
+            body_force=force,
+            rest_shape=rest_shape,
         )
         if self.context is not None:
             context = self._encode_context(state, self.context, average=average)
             state = replace(state, context=context)
         return state
-
-    def _coming_walls(self, given: Batch) -> Tensor:
-        """Return the velocities of the walls from the last frame on [length/frame]."""
-        if not self.options.wall_velocity or given.wall_velocity is None:
-            dimension = given.position.shape[2]
-            wall_count = 2 * dimension
-            return given.position.new_zeros(given.windows, 1, wall_count, dimension)
-        last_frame = given.frames - 1
-        per_second = given.wall_velocity[:, last_frame:]
-        return per_second * self.info.frame_interval
 
     @property
     def forcing_seen(self) -> frozenset[str]:
@@ -208,50 +233,6 @@ class NeuralMPM(Baseline):
         if self.options.body_force:
             return frozenset({"body_force", "obstacle"})
         return frozenset({"obstacle"})
-
-    def _coming_force(self, given: Batch) -> Tensor | None:
-        """Return the force from the last frame on [length/frame^2], if it is seen.
-
-        Raises:
-            DataError: no force drives the flow.
-        """
-        if not self.options.body_force:
-            return None
-        last_frame = given.frames - 1
-        return require_force(given, self.info)[:, last_frame:]
-
-    def _scaled_viscosity(self, given: Batch) -> Tensor:
-        """Return the logarithm of the viscosity of each window, shape [window, 1].
-
-        It is 0 at ``VISCOSITY_UNIT``. There is no column where the U-Net does not see
-        it.
-
-        Raises:
-            DataError: the viscosity is not known.
-        """
-        if not self.options.viscosity:
-            return given.position.new_zeros(given.windows, 0)
-        if given.viscosity is None:
-            raise DataError(
-                "the viscosity is not known; train without it: --set "
-                "model.viscosity=false",
-                where=f"{self.info.split} {self.info.size}",
-            )
-        viscosity = given.viscosity.clamp(min=LEAST_VISCOSITY)
-        logarithm = torch.log(viscosity / VISCOSITY_UNIT)
-        return logarithm[:, None]
-
-    def _rest_shape(self, given: Batch, layer: Tensor) -> RestShape | None:
-        """Return the rest shape of solids; None where strain is not asked for."""
-        if not self.options.strain:
-            return None
-        return RestShape.build(
-            self.grid,
-            first_frame(given),
-            layer,
-            given.windows * len(self.options.materials),
-            is_solid=given.material != LIQUID,
-        )
 
     def _encode_context(
         self, state: GridState, network: ContextNetwork, *, average: bool
@@ -265,7 +246,7 @@ class NeuralMPM(Baseline):
         images = [fields]
         if average and self.options.average:
             images = []
-            for matrix in self._mirror_matrices():
+            for matrix in mirror_matrices(self.options.symmetry, self.grid.dimension):
                 blocks = self.encoder.mirror_fields(matrix)
                 image = mirror_field(fields, matrix, blocks)
                 images.append(image)
@@ -293,7 +274,15 @@ class NeuralMPM(Baseline):
         """
         stencil = self.grid.stencil(state.position, state.layer)
         fields, grid_velocity = self.encoder.encode(state, stencil)
-        inputs = self._network_inputs(state, fields)
+        constants = torch.cat([state.context, state.viscosity], dim=1)
+        node_axes = [1] * self.grid.dimension
+        one_node = constants.view(*constants.shape, *node_axes)
+        parts = [fields, one_node.expand(-1, -1, *self.grid.shape)]
+        if self.options.wall_velocity:
+            parts.append(self.encoder.forcing(state.walls))
+        if state.body_force is not None:
+            parts.append(self.encoder.force(state.body_force))
+        inputs = torch.cat(parts, dim=1)
         if average and self.options.average:
             output = self._predict_mirror_averaged(inputs)
         else:
@@ -308,30 +297,20 @@ class NeuralMPM(Baseline):
         gathered = gathered.view(len(stencil.weight), -1, axes)
         velocity_around, *accelerations = gathered.unbind(dim=1)
         frames = self._integrate(state, velocity_around, accelerations)
-        return self._after(state, frames), frames
 
-    def _mirror_matrices(self) -> Tensor:
-        """Return the matrices of all mirror images, shape [image, axis, axis]."""
-        return mirror_matrices(self.options.symmetry, self.grid.dimension)
-
-    def _network_inputs(self, state: GridState, fields: Tensor) -> Tensor:
-        """Return what the U-Net sees, shape [window, channel, x node, y node].
-
-        These are fields, context, viscosity and forcing.
-        """
-        constants = torch.cat([state.context, state.viscosity], dim=1)
-        windows, channels = constants.shape
-        node_axes = [1] * self.grid.dimension
-        one_node = constants.view(windows, channels, *node_axes)
-        constant_fields = one_node.expand(-1, -1, *self.grid.shape)
-        parts = [fields, constant_fields]
-        if self.options.wall_velocity:
-            forcing = self.encoder.forcing(state.walls)
-            parts.append(forcing)
-        if state.body_force is not None:
-            force = self.encoder.force(state.body_force)
-            parts.append(force)
-        return torch.cat(parts, dim=1)
+        positions, velocities = zip(*frames, strict=True)
+        velocity = torch.cat([state.velocity, torch.stack(velocities, dim=1)], dim=1)
+        force = state.body_force
+        if force is not None:
+            force = skip_frames(force, len(frames))
+        following = replace(
+            state,
+            position=positions[-1],
+            velocity=velocity[:, -self.options.velocities :],
+            walls=skip_frames(state.walls, len(frames)),
+            body_force=force,
+        )
+        return following, frames
 
     def _predict_mirror_averaged(self, inputs: Tensor) -> Tensor:
         """Return the mean of the U-Net's outputs for all mirror images, mirrored back.
@@ -341,7 +320,7 @@ class NeuralMPM(Baseline):
         """
         constant_count = self.options.context + self.options.viscosity
         outputs = []
-        for matrix in self._mirror_matrices():
+        for matrix in mirror_matrices(self.options.symmetry, self.grid.dimension):
             input_blocks = [
                 *self.encoder.mirror_fields(matrix),
                 torch.eye(constant_count),
@@ -384,22 +363,3 @@ class NeuralMPM(Baseline):
             grid_velocity = grid_velocity + acceleration
             frames.append((position, velocity))
         return frames
-
-    def _after(self, state: GridState, frames: list[Frame]) -> GridState:
-        """Return the state after the frames of a bundle."""
-        frame_count = len(frames)
-        last_position, _ = frames[-1]
-        new_velocities = [velocity for _, velocity in frames]
-        new_velocity = torch.stack(new_velocities, dim=1)
-        velocity = torch.cat([state.velocity, new_velocity], dim=1)
-        walls = skip_frames(state.walls, frame_count)
-        force = state.body_force
-        if force is not None:
-            force = skip_frames(force, frame_count)
-        return replace(
-            state,
-            position=last_position,
-            velocity=velocity[:, -self.options.velocities :],
-            walls=walls,
-            body_force=force,
-        )

@@ -180,25 +180,14 @@ class FieldEncoder(nn.Module):
         per_window = per_material.reshape(windows, -1, *grid.shape)
         wall_distance = self.wall_distance.expand(windows, *self.wall_distance.shape)
         fields = torch.cat([per_window, wall_distance], dim=1)
-        if self.options.mixture:
-            channel_count = 1 + velocity_channels
-            weight_and_velocity = sums[:, :channel_count]
-            return fields, self._mixture_velocity(weight_and_velocity)
-        return fields, last_velocity
+        if not self.options.mixture:
+            return fields, last_velocity
 
-    def _mixture_velocity(self, sums: Tensor) -> Tensor:
-        """Return the last velocity of all materials together, for each layer.
-
-        ``sums`` are those of weights and velocities.
-        """
-        channels = sums.shape[1]
-        by_material = sums.view(-1, self.material_count, channels, *self.grid.shape)
-        total = by_material.sum(dim=1)
-        total = total / self.weight_unit
-        weight = total[:, :1]
-        last_momentum = total[:, -self.grid.dimension :]
-        velocity = last_momentum / weight.clamp(min=EMPTY_WEIGHT)
-        return velocity.repeat_interleave(self.material_count, dim=0)
+        # the last velocity of all materials together, for each layer
+        by_material = sums.view(windows, self.material_count, -1, *grid.shape)
+        total = by_material.sum(dim=1)[:, : 1 + velocity_channels] / self.weight_unit
+        mixture = total[:, -axes:] / total[:, :1].clamp(min=EMPTY_WEIGHT)
+        return fields, mixture.repeat_interleave(self.material_count, dim=0)
 
     def forcing(self, walls: Tensor) -> Tensor:
         """Return the velocities of moving walls in the coming frames, beside the walls.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim import AdamW
 
-from lagbench.errors import UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import UsageError, WorkFailedError
 
 from .baseline import Baseline
 from .recipe import TrainingOptions
@@ -34,7 +34,6 @@ class Optimisation:
 
     Raises:
         UsageError: the model has no parameters.
-        UnreadableFileError: the state of the optimiser is not that of this model.
     """
 
     def __init__(
@@ -69,12 +68,7 @@ class Optimisation:
         parameters = dict(model.named_parameters())
         for key, value in (state or {}).items():
             name, _, kind = key.rpartition("/")
-            parameter = parameters.get(name)
-            if parameter is None or (kind != "step" and value.shape != parameter.shape):
-                raise UnreadableFileError(
-                    f"the state {key} of the optimiser does not fit the model; train "
-                    "anew with --fresh"
-                )
+            parameter = parameters[name]
             self.optimizer.state[parameter][kind] = value.to(parameter.device)
 
     def state_tensors(self) -> dict[str, Tensor]:

@@ -71,15 +71,25 @@ class ParticleGrid(nn.Module):
         self.spacing = widest_side / cells
 
         cell_widths = []
-        for axis, interval in enumerate(bounds):
+        for axis, (low, high) in enumerate(bounds):
+            width = self.spacing
             if box.periodic[axis]:
-                width, places = self._periodic_places(interval, multiple)
+                # The multiple of nodes that is nearest to the number of spacings in the
+                # period, but at least three: a particle touches three different nodes.
+                nearest_multiples = round((high - low) / self.spacing / multiple)
+                fewest_multiples = math.ceil(3 / multiple)
+                nodes = multiple * max(nearest_multiples, fewest_multiples)
+                width = (high - low) / nodes
+                numbers = torch.arange(nodes, dtype=torch.float64)
+                places = low + (numbers + 0.5) * width
             else:
-                width = self.spacing
-                places = self._node_places(interval, multiple)
+                nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
+                nodes += -nodes % multiple
+                numbers = torch.arange(nodes, dtype=torch.float64)
+                middle = (low + high) / 2
+                places = middle + (numbers - (nodes - 1) / 2) * self.spacing
             cell_widths.append(width)
-            name = f"axis_{AXES[axis]}"
-            self.register_buffer(name, places, persistent=False)
+            self.register_buffer(f"axis_{AXES[axis]}", places.float(), persistent=False)
 
         ends = torch.tensor(bounds)
         low = ends[:, 0]
@@ -88,42 +98,6 @@ class ParticleGrid(nn.Module):
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
         self.register_buffer("cell", cell, persistent=False)
-
-    def _node_places(self, interval: tuple[float, float], multiple: int) -> Tensor:
-        """Return the nodes' places between two walls [length], shape [node]."""
-        low, high = interval
-        spacings = (high - low) / self.spacing
-        cells = math.ceil(spacings - 1e-6)
-        nodes = cells + 2
-        nodes += -nodes % multiple
-
-        middle = (low + high) / 2
-        middle_node = (nodes - 1) / 2
-        numbers = torch.arange(nodes, dtype=torch.float64)
-        steps = numbers - middle_node
-        places = middle + steps * self.spacing
-        return places.to(torch.float32)
-
-    def _periodic_places(
-        self, interval: tuple[float, float], divisor: int
-    ) -> tuple[float, Tensor]:
-        """Return a cell's width and the nodes' places along a periodic axis [length].
-
-        The number of nodes is the multiple of ``divisor`` that is nearest to the number
-        of spacings in the period. It is at least three, because a particle touches
-        three nodes, which must be different ones.
-        """
-        low, high = interval
-        period = high - low
-        nearest_multiples = round(period / self.spacing / divisor)
-        fewest_multiples = math.ceil(3 / divisor)
-        nodes = divisor * max(nearest_multiples, fewest_multiples)
-
-        width = period / nodes
-        numbers = torch.arange(nodes, dtype=torch.float64)
-        steps = numbers + 0.5
-        places = low + steps * width
-        return width, places.to(torch.float32)
 
     @property
     def dimension(self) -> int:

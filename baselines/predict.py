@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import expand_home
@@ -29,19 +31,9 @@ from .baseline import Baseline, DatasetInfo, count_parameters, rescale
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .dataset_info import find_forcing
-from .machine import (
-    choose_device,
-    hardware,
-    use_threads,
-)
+from .machine import choose_device, hardware, use_threads
 from .recipe import change_options
-from .rollout import (
-    Rollout,
-    count_predicted,
-    roll_out,
-    scenario_batch,
-    scenario_paths,
-)
+from .rollout import count_predicted, roll_out, scenario_batch, scenario_paths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,19 +165,20 @@ def predict(
         model = model.to(machine)
         if batch is None:
             batch = 1 if machine == "cpu" else len(files)
-        rollouts = _TimedRollouts(
-            model,
-            info,
-            list(files.values()),
-            min(batch, len(files)),
-            machine,
-            viscosity=tier.viscosity(),
-        )
+        batch = min(batch, len(files))
         found_hardware = hardware(machine)
+        thread_count = torch.get_num_threads()
         label = str(found_hardware["device"])
         if machine == "cpu":
-            plural = "s" if rollouts.threads > 1 else ""
-            label = f"{found_hardware['processor']}, {rollouts.threads} thread{plural}"
+            plural = "s" if thread_count > 1 else ""
+            label = f"{found_hardware['processor']}, {thread_count} thread{plural}"
+
+        def read_clocks() -> NDArray[np.float64]:
+            """Return the times of the wall and of the processor [s]."""
+            if machine == "cuda":
+                torch.cuda.synchronize()
+            return np.array([time.perf_counter(), time.process_time()])
+
         writer = PredictionsWriter(
             output_path,
             split=info.split,
@@ -203,12 +196,39 @@ def predict(
         meter = Meter(progress)
         meter.begin("predicting", total=len(files), scenarios=len(files))
         solver_seconds = None
+        seconds = np.zeros(2)  # of the rollouts, on the wall and of the processor
+        frames = 0  # that the model predicted; frozen ones cost nothing
+        diverged = {}
+        paths = list(files.values())
         with writer:
-            for rollout in rollouts:
-                position = rollout.position.numpy()
-                writer.add(rollout.scenario, position, diverged_at=rollout.diverged_at)
-                meter.count(1, scenarios=1)
-            seconds_per_frame = rollouts.seconds / rollouts.frames
+            for first in range(0, len(paths), batch):
+                given_frames = scenario_batch(
+                    paths[first : first + batch],
+                    slice(0, info.input_frames),
+                    viscosity=tier.viscosity(),
+                ).to(machine)
+                if first == 0:
+                    roll_out(model, given_frames, 1)  # to warm up
+                before = read_clocks()
+                rollouts = roll_out(model, given_frames, info.horizon)
+                seconds += read_clocks() - before
+                for rollout in rollouts:
+                    frames += count_predicted(
+                        rollout, info.horizon, input_frames=info.input_frames
+                    )
+                    diverged_at = rollout.diverged_at
+                    if diverged_at is not None:
+                        diverged[rollout.scenario] = diverged_at
+                    writer.add(
+                        rollout.scenario,
+                        rollout.position.numpy(),
+                        diverged_at=diverged_at,
+                    )
+                    meter.count(1, scenarios=1)
+            wall_per_frame, processor_per_frame = (seconds / frames).tolist()
+            seconds_per_frame = wall_per_frame
+            if machine == "cpu":
+                seconds_per_frame = processor_per_frame
             writer.label(seconds_per_frame=seconds_per_frame)
             if time_solver is not None:
                 solver_seconds = time_solver(info.split, info.size)
@@ -224,15 +244,15 @@ def predict(
         method=method or model.method,
         scenarios=len(files),
         frames=info.horizon,
-        batch=rollouts.side_by_side,
+        batch=batch,
         seconds_per_frame=seconds_per_frame,
-        clock=rollouts.clock,
-        wall_seconds_per_frame=rollouts.wall_seconds / rollouts.frames,
-        threads=rollouts.threads,
+        clock="processor" if machine == "cpu" else "wall",
+        wall_seconds_per_frame=wall_per_frame,
+        threads=thread_count,
         solver_seconds_per_frame=solver_seconds,
         device=label,
         parameters=count_parameters(model),
-        diverged=rollouts.diverged,
+        diverged=diverged,
     )
     values = {**asdict(result), "path": output_path.name}
     text = json.dumps(values, indent=2, sort_keys=True)
@@ -252,69 +272,6 @@ def costs_path(output: Path) -> Path:
     if output.suffix.lower() == ".nc":
         return output.with_suffix(".json")
     return output.with_name(f"{output.name}.json")
-
-
-class _TimedRollouts:
-    """Rolls scenarios out, some side by side, and takes the time."""
-
-    def __init__(
-        self,
-        model: Baseline,
-        info: DatasetInfo,
-        paths: list[Path],
-        side_by_side: int,
-        machine: str,
-        *,
-        viscosity: float | None,
-    ) -> None:
-        self.seconds = 0.0  # time of the rollouts by the clock below [s]
-        self.wall_seconds = 0.0  # time of the rollouts on the wall [s]
-        self.clock = "wall"  # clock of the times, 'processor' or 'wall'
-        if machine == "cpu":
-            self.clock = "processor"
-        self.threads = torch.get_num_threads()
-        # frames that the model predicted, of all scenarios; frozen ones cost nothing
-        self.frames = 0
-        # scenario id to the absolute frame from which its rollout is frozen
-        self.diverged: dict[int, int] = {}
-        self.paths = paths  # scenario files
-        self.side_by_side = side_by_side  # scenarios of a group
-        self.model = model
-        self.info = info
-        self._machine = machine
-        # of scenarios whose files state none [length^2/s]
-        self._viscosity = viscosity
-
-    def __iter__(self) -> Iterator[Rollout]:
-        """Yield the rollout of every scenario."""
-        input_frames = slice(0, self.info.input_frames)
-        for first in range(0, len(self.paths), self.side_by_side):
-            group = self.paths[first : first + self.side_by_side]
-            given_frames = scenario_batch(
-                group, input_frames, viscosity=self._viscosity
-            )
-            given_frames = given_frames.to(self._machine)
-            if first == 0:
-                roll_out(self.model, given_frames, 1)  # to warm up
-            start_time = self._read_clock()
-            wall_start = time.perf_counter()
-            rollouts = roll_out(self.model, given_frames, self.info.horizon)
-            self.seconds += self._read_clock() - start_time
-            self.wall_seconds += time.perf_counter() - wall_start
-            for rollout in rollouts:
-                self.frames += count_predicted(
-                    rollout, self.info.horizon, input_frames=self.info.input_frames
-                )
-                if rollout.diverged_at is not None:
-                    self.diverged[rollout.scenario] = rollout.diverged_at
-            yield from rollouts
-
-    def _read_clock(self) -> float:
-        if self._machine == "cuda":
-            torch.cuda.synchronize()
-        if self.clock == "processor":
-            return time.process_time()
-        return time.perf_counter()
 
 
 def restore_for_size(

@@ -87,8 +87,10 @@ class Relaxation(nn.Module):
             position: positions [length], shape [particle, axis].
             sample: window of each particle, ascending, int64, shape [particle].
         """
-        pairs = self._measure(position, *self._find_neighbours(position, sample))
-        return _density(pairs, len(position))
+        sender, receiver = radius_graph(
+            position, self.support, sample, box=self.box.box
+        )
+        return _density(self._measure(position, sender, receiver), len(position))
 
     def limit(self, position: Tensor, sample: Tensor) -> Tensor:
         """Return the largest density that is left alone [1], shape [window].
@@ -124,7 +126,9 @@ class Relaxation(nn.Module):
                 [particle, axis + 1]; None without one.
         """
         own_limit = limit[sample]
-        sender, receiver = self._find_neighbours(position, sample)
+        sender, receiver = radius_graph(
+            position, self.support, sample, box=self.box.box
+        )
         for _ in range(self.iterations):
             pairs = self._measure(position, sender, receiver)
             density = _density(pairs, len(position))
@@ -137,15 +141,6 @@ class Relaxation(nn.Module):
             if obstacle is not None:
                 position = self.box.outside(position, obstacle)
         return position
-
-    def _find_neighbours(
-        self, position: Tensor, sample: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return senders and receivers of pairs within the support."""
-        sender, receiver = radius_graph(
-            position, self.support, sample, box=self.box.box
-        )
-        return sender, receiver
 
     def _measure(self, position: Tensor, sender: Tensor, receiver: Tensor) -> Pairs:
         way = self.box.displacement(position[sender], position[receiver])

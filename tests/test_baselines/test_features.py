@@ -14,7 +14,6 @@ from lagbench.baselines.augmentation import (
     draw_mirror_matrices,
     mirror_batch,
 )
-from lagbench.baselines.baseline import Batch
 from lagbench.baselines.graph import (
     NodeFeatures,
     Standardisation,
@@ -33,13 +32,6 @@ def generator(seed: int = 0) -> torch.Generator:
     """Return a seeded source of randomness."""
     source = torch.Generator()
     return source.manual_seed(seed)
-
-
-def two_swirls() -> Batch:
-    """Return two windows of three frames, with walls."""
-    first = swirl(0, 3)
-    second = swirl(1, 3)
-    return batch(first, second, walls=True)
 
 
 def node_features(**options: bool) -> NodeFeatures:
@@ -212,31 +204,6 @@ def test_moving_walls_are_felt_near_them() -> None:
 
     without_walls = features(position, at_rest, material)
     assert not without_walls[:, 30:].any()
-
-
-def test_features_do_not_see_where_particles_are() -> None:
-    """Away from walls a common shift changes no bit of any feature."""
-    features = node_features(moving_walls=True)
-    cloud = jittered(1, 8, 0.3, 0.6)
-    lattice = np.round(cloud * 1024) / 1024
-    position = torch.from_numpy(lattice).float()
-    count = len(position)
-    draw = torch.randn(count, 5, 2, generator=generator())
-    velocity = 0.01 * draw
-    material = torch.arange(count) % 4
-    walls = torch.randn(count, 4, 2, generator=generator())
-    shift = torch.tensor([0.125, -0.0625])
-    shifted = position + shift
-
-    edges = radius_graph(position, RADIUS)
-    shifted_edges = radius_graph(shifted, RADIUS)
-    assert torch.equal(shifted_edges, edges)
-    of_nodes = features(position, velocity, material, walls)
-    of_shifted_nodes = features(shifted, velocity, material, walls)
-    assert torch.equal(of_shifted_nodes, of_nodes)
-    of_edges = edge_features(position, edges, RADIUS, UNIT_BOX)
-    of_shifted_edges = edge_features(shifted, edges, RADIUS, UNIT_BOX)
-    assert torch.equal(of_shifted_edges, of_edges)
 
 
 def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:

@@ -13,10 +13,8 @@ from simple_models import RADIUS, batch, info, network, rolled, swirl
 from torch import Tensor
 from torch.testing import assert_close
 
-from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.forcing import (
-    ForcingFeatures,
     force_at,
     obstacle_features,
     skip_frames,
@@ -131,21 +129,6 @@ def test_the_surface_of_a_circle_or_ball_is_seen_within_the_reach(name: str) -> 
     assert is_beyond.any()
     assert (features[is_beyond, 0] == 1.0).all()
     assert (features[is_beyond, 1:] == 0.0).all()
-
-
-def test_the_distance_is_that_to_the_nearest_point_of_the_surface() -> None:
-    """Whole numbers: 3, 4 and 5 in the plane, 2, 3, 6 and 7 in space."""
-    plane = TensorBox(BOXES["walls"])
-    position = torch.tensor([[0.3, 0.4]])
-    circle = torch.tensor([[0.0, 0.0, 0.25]])
-    features = obstacle_features(position, circle, 0.5, plane)
-    assert_close(features, torch.tensor([[0.5, 0.5 * 0.6, 0.5 * 0.8]]))
-    cube = TensorBox(BOXES["cube"])
-    position = torch.tensor([[0.2, 0.3, 0.6]])
-    ball = torch.tensor([[0.0, 0.0, 0.0, 0.35]])
-    features = obstacle_features(position, ball, 0.7, cube)
-    parts = torch.tensor([[1.0, 2.0 / 7.0, 3.0 / 7.0, 6.0 / 7.0]])
-    assert_close(features, 0.5 * parts)
 
 
 def test_the_centre_of_an_obstacle_has_no_direction_and_no_gradient() -> None:
@@ -275,29 +258,3 @@ def test_nodes_see_force_and_obstacle_after_all_else(name: str) -> None:
         reach = 3.0 * RADIUS
         surface = obstacle_features(position, own, reach, box_of_tensors)
         assert_close(features[:, plain + axes :], surface, rtol=0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("matrix", [[-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
-@pytest.mark.parametrize("name", ["walls", "periodic", "cube"])
-def test_images_of_a_window_have_images_of_the_features(
-    name: str, matrix: list[float]
-) -> None:
-    """Force and direction turn with the window, the distance stays."""
-    box = BOXES[name]
-    signs = torch.tensor([*matrix, 1.0][: box.dimension])
-    window = forced_batch(box)
-    image = torch.diag(signs).expand(2, box.dimension, box.dimension)
-    mirrored = mirror_batch(window, image, box.bounds)
-    figures = info_of_box(box)
-    see = ForcingFeatures(
-        figures, body_force=True, obstacle=True, force_unit=1e-3, reach=0.2
-    )
-
-    def features(given: Batch) -> Tensor:
-        force = see.coming_force(given)
-        assert force is not None
-        last = given.position[:, -1]
-        return see(last, given.sample, force[:, 0], see.find_obstacle(given))
-
-    expected = features(window) * torch.cat([signs, torch.ones(1), signs])
-    assert_close(features(mirrored), expected, rtol=0.0, atol=1e-5)

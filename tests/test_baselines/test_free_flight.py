@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.sparse.csgraph import connected_components
-from simple_models import batch, info, network, rolled
+from simple_models import info
 from torch import Tensor
 
 from lagbench.baselines.free_flight import FALL_UNIT, FreeFlight, find_bodies
@@ -41,14 +41,6 @@ def body_numbers(
     return body.tolist(), flies.tolist()
 
 
-def test_bodies_are_what_is_linked_within_reach() -> None:
-    """A chain of particles is one body, one that is farther off another."""
-    chain = [[0.3, 0.5], [0.39, 0.5], [0.48, 0.5]]
-    body, flies = body_numbers([*chain, [0.59, 0.5]])
-    assert body == [0, 0, 0, 1]
-    assert flies == [True, True]
-
-
 def test_walls_reach_half_as_far() -> None:
     """They stop a whole body that has one particle near them."""
     near = [[0.04, 0.5], [0.12, 0.5]]
@@ -66,12 +58,6 @@ def test_bodies_that_meet_within_the_frame_are_one() -> None:
     assert body_numbers(pair, velocity=towards)[0] == [0, 0]
     _, flies = body_numbers([[0.5, 0.3]], velocity=[[0.0, -0.5]])
     assert flies == [False]
-
-
-def test_windows_have_bodies_of_their_own() -> None:
-    """Particles at one place in two windows are two bodies."""
-    body, _ = body_numbers([[0.5, 0.5], [0.5, 0.5]], sample=[0, 1])
-    assert body == [0, 1]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -158,32 +144,6 @@ def test_means_of_flying_bodies_are_gravity(dimension: int) -> None:
         inside = corrected[body] - mean
         expected = acceleration[body] - acceleration[body].mean(dim=0)
         torch.testing.assert_close(inside, expected)
-
-
-def test_the_centre_of_a_free_body_moves_along_a_parabola() -> None:
-    """Whatever a network predicts: x0 + v n + g n (n + 1) / 2 after n frames."""
-    model = network(awake=True, free_flight=2.0)
-    gravity = -2e-4
-    assert model.free_flight is not None
-    unit = FALL_UNIT * model.acceleration_std
-    with torch.no_grad():
-        model.free_flight.fall[1] = gravity / unit
-
-    rng = np.random.default_rng(2)
-    body = rng.uniform(0.55, 0.7, (1, 40, 2))
-    speed = np.array([-1e-3, 2e-3])
-    frames = np.concatenate([body, body + speed])
-    positions = rolled(model, batch(frames), 20).double()
-
-    step = np.arange(1, 21)
-    fall = np.array([0.0, gravity])
-    start = frames[-1].mean(axis=0)
-    path = start + speed * step[:, None] + fall * (step * (step + 1) / 2)[:, None]
-    np.testing.assert_allclose(positions.mean(dim=0).numpy(), path, atol=2e-6)
-
-    alone = rolled(network(awake=True), batch(frames), 20).double()
-    straight = start + speed * step[:, None]
-    assert np.abs(alone.mean(dim=0).numpy() - straight).max() > 1e-4
 
 
 @pytest.mark.slow

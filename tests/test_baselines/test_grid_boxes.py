@@ -240,27 +240,6 @@ def test_gather_is_the_adjoint_of_spread(name: str) -> None:
     assert_close(*gradients)
 
 
-@pytest.mark.parametrize("name", ["square", "oblong", "cube"])
-def test_a_shift_by_a_cell_shifts_the_fields(name: str) -> None:
-    """Over the seam too."""
-    box = BOXES[name]
-    grid = make_grid(name)
-    place = draw_places(name, 300)
-    mass = torch.ones(300, 1)
-
-    def density(position: Positions) -> Tensor:
-        wrapped = torch.from_numpy(box.wrap(position))
-        stencil = grid.stencil(wrapped.float(), one_layer(300))
-        return grid.spread(stencil, mass, 1)[0, 0]
-
-    steps = (1, -2, 3)[: box.dimension]
-    axes = tuple(range(box.dimension))
-    shift = np.array(steps) * grid.cell.numpy()
-    moved = density(place + shift)
-    expected = density(place).roll(steps, axes)
-    assert_close(moved, expected, rtol=0, atol=2e-5)
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -311,23 +290,6 @@ def test_a_flow_through_the_periodic_ends_continues(name: str) -> None:
     assert greatest(error) < 1e-5
     assert float(path.min()) >= 0.0
     assert float(path.max()) < 1.0
-
-
-def test_images_of_the_cube_are_a_group() -> None:
-    """48 signed permutations; four leave the direction of gravity as it is."""
-    images = mirror_matrices(Symmetry.SQUARE, 3)
-    distinct = images.unique(dim=0)
-    assert len(images) == 48
-    assert len(distinct) == 48
-    products = torch.einsum("aij,bjk->abik", images, images)
-    distinct_products = products.flatten(0, 1).unique(dim=0)
-    assert torch.equal(distinct_products, distinct)
-    assert_close(images[0], torch.eye(3))
-    mirrors = mirror_matrices(Symmetry.MIRROR, 3)
-    up = torch.tensor([0.0, 1.0, 0.0])
-    assert len(mirrors) == 4
-    image_of_y = mirrors[:, 1]
-    assert torch.equal(image_of_y, up.expand(4, 3))
 
 
 @pytest.mark.slow

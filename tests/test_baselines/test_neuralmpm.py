@@ -18,10 +18,7 @@ from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import Symmetry, mirror_batch, mirror_matrices
 from lagbench.baselines.baseline import Batch
-from lagbench.baselines.catalogue import find
 from lagbench.baselines.neuralmpm import NeuralMPM
-from lagbench.baselines.recipe import recipe_for
-from lagbench.data.registry import load
 
 SMALL: dict[str, object] = {
     "cells": 10,
@@ -357,25 +354,6 @@ def test_a_known_network_has_a_known_rollout() -> None:
     assert_allclose(displacement.numpy(), expected, rtol=1e-3)
 
 
-def test_images_roll_out_as_images() -> None:
-    """Transfers and walls know no direction: all eight mirror images of the box.
-
-    The network of this test knows none either.
-    """
-    model = surrogate(materials=[0], smoothing=0.2)
-    drag_rate = -0.5 * model.velocity_std / model.acceleration_std
-    model.network = Drag(drag_rate, 2)
-    frames = swirl(0, 3, (0.2, 0.2))
-    window = liquid(frames)
-    path = rolled(model, window, 5)
-    for matrix in mirror_matrices(Symmetry.SQUARE):
-        image_matrix = matrix[None]
-        image = mirror_batch(window, image_matrix, info().bounds)
-        expected = (path - 0.5) @ matrix.T + 0.5
-        image_path = rolled(model, image, 5)
-        assert_close(image_path, expected, rtol=0, atol=1e-5)
-
-
 def test_each_frame_is_driven_by_its_own_walls() -> None:
     """A bundle sees the walls of its two frames and none after them."""
     model = surrogate(awake=0.1, wall_velocity=True)
@@ -438,35 +416,3 @@ def test_learns_a_swirl() -> None:
         terms["velocity"].backward()
         optimiser.step()
     assert rollout_error() < untrained_error / 3
-
-
-SPLITS = ["cavity", "curl-noise", "fluid", "multimaterial"]
-
-
-@pytest.mark.parametrize("size", ["tiny", "mini", "full"])
-@pytest.mark.parametrize("split", SPLITS)
-def test_recipes_fit_every_split(split: str, size: str) -> None:
-    """Walls drive the cavity alone, and gravity allows the mirror alone.
-
-    The materials are those of the split, and the weights take at most 4 MB.
-    """
-    dataset_size = load().size(split, size)
-    recipe = recipe_for(find("neuralmpm"), split, size)
-    is_cavity = split == "cavity"
-    dataset_info = info(moving_walls=is_cavity, bounds=dataset_size.bounds)
-    model = NeuralMPM.build(recipe.model, dataset_info)
-
-    gravity = dataset_size.parameters.get("gravity")
-    symmetry = "square"
-    if gravity and gravity.value:
-        symmetry = "mirror"
-    material_count = 1
-    if split == "multimaterial":
-        material_count = 4
-    assert recipe.model["wall_velocity"] is is_cavity
-    assert recipe.model["symmetry"] == symmetry
-    assert len(recipe.model["materials"]) == material_count
-
-    parameters = model.parameters()
-    parameter_count = sum(weight.numel() for weight in parameters)
-    assert 2 * parameter_count <= 4e6  # bytes of the weights in bfloat16

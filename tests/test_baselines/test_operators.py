@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import random
 from collections.abc import Callable, Sequence
@@ -13,12 +12,10 @@ import torch
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from simple_models import OPERATORS, Graph, graph
-from torch_geometric.nn import PointNetConv
 
 from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Operator
-from lagbench.baselines.operators.pointnet import PointNet
 from lagbench.baselines.operators.supergat import (
     START,
     SuperGAT,
@@ -268,32 +265,6 @@ def test_an_operator_is_its_published_equation(
     assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_pointnet_is_that_of_pyg() -> None:
-    """With relative positions as edges, PointNet is PyG's PointNetConv."""
-    inputs = small_graph()
-    layer = build_random(PointNet)
-    assert isinstance(layer, PointNet)
-    node_count = len(inputs.node)
-    position = torch.randn(node_count, LATENT, dtype=torch.float64)
-
-    first = torch.nn.Linear(3 * LATENT, HIDDEN).double()
-    first_weights = [layer.of_node.weight, layer.of_edge.weight]
-    with torch.no_grad():
-        first.weight[:] = torch.cat(first_weights, dim=1)
-        first.bias[:] = layer.of_node.bias
-    with torch.random.fork_rng():
-        convolution = PointNetConv()  # Its constructor would reset the weights.
-    other_layers = copy.deepcopy(layer.local)
-    convolution.local_nn = torch.nn.Sequential(first, *other_layers)
-
-    sender, receiver = inputs.edge_index
-    x = inputs.node.double()
-    edge = position[sender] - position[receiver]
-    update, _ = layer(x, inputs.edge_index, edge)
-    expected = convolution(x, position, inputs.edge_index)
-    torch.testing.assert_close(update, expected, rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("operator", OPERATORS)
 def test_the_order_of_nodes_and_edges_means_nothing(operator: type[Operator]) -> None:
     """Nodes in another order get the same updates in that order."""
@@ -390,27 +361,6 @@ def test_there_is_no_link_loss_in_evaluation() -> None:
     layer = build_random(SuperGAT, scale=0.4).eval()
     _, losses = layer(node.double(), edge_index, edge)
     assert not losses
-
-
-def test_supergat_learns_who_are_neighbours() -> None:
-    torch.manual_seed(0)
-    inputs = graph(40, 200, node=32, edge=16)
-    layer = SuperGAT(32, 16, 16)
-    inputs.node.mul_(8.0)  # sums of about 8 normalised messages
-    generator = seeded(0)
-    parameters = layer.parameters()
-    optimizer = torch.optim.Adam(parameters, lr=1e-2)
-    course = []
-    for _ in range(60):
-        _, losses = layer(*inputs, generator=generator)
-        loss = losses["link"]
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        course.append(loss.item())
-    first_loss = np.mean(course[:5])
-    last_loss = np.mean(course[-5:])
-    assert last_loss < 0.75 * first_loss
 
 
 def global_random_states() -> tuple[object, ...]:

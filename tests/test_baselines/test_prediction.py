@@ -14,13 +14,12 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import INFO, Bursting, Drift, State, install
-from torch import Tensor
+from simple_models import INFO, Bursting, Drift, install
 
 from lagbench.baselines import predict as prediction
 from lagbench.baselines import runner
 from lagbench.baselines.baseline import Batch, DatasetInfo
-from lagbench.baselines.catalogue import find, load_all
+from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.predict import (
@@ -28,7 +27,7 @@ from lagbench.baselines.predict import (
     predict,
 )
 from lagbench.baselines.recipe import recipe_for
-from lagbench.baselines.rollout import roll_out, round_parameters, select_window
+from lagbench.baselines.rollout import roll_out, select_window
 from lagbench.baselines.runner import WeightsRunner
 from lagbench.data.registry import Registry
 from lagbench.errors import (
@@ -318,48 +317,6 @@ def test_a_diverging_scenario_leaves_others_alone() -> None:
     assert bad.position.shape == (8, 3, 2)
 
 
-class Wrong(Drift):
-    """A Drift with another output."""
-
-    change_output: Any = None
-
-    def advance(self, state: State) -> Any:
-        """Change the output."""
-        state, position = super().advance(state)
-        return self.change_output(state, position)
-
-
-def test_a_rollout_is_frozen_before_it_is_too_far(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The scorer would refuse positions farther than ten boxes away."""
-
-    def flee(state: State, position: Tensor) -> Any:
-        boxes_to_the_right = float(state[2] - 1)
-        return state, position + torch.tensor([boxes_to_the_right, 0.0])
-
-    monkeypatch.setattr(Wrong, "change_output", staticmethod(flee))
-    model = Wrong.build({"start": 0.0}, INFO)
-    window = make_windows([0.9])
-    (rollout,) = roll_out(model, window, 30)
-    assert rollout.diverged_at is not None
-    farthest = float(rollout.position.max())
-    assert 8.0 < farthest < 10.6
-    assert torch.isfinite(rollout.position).all()
-
-
-def test_rounded_parameters_come_back_to_the_bit() -> None:
-    model = torch.nn.Linear(8, 8)
-    state = model.state_dict()
-    before = {name: value.clone() for name, value in state.items()}
-    weight = before["weight"]
-    with round_parameters(model):
-        assert torch.equal(model.weight, weight.bfloat16().float())
-        assert not torch.equal(model.weight, weight)
-    for name, value in model.state_dict().items():
-        assert torch.equal(value, before[name])
-
-
 def test_only_the_input_frames_are_read(
     run: Predict, copied: Callable[[], Path]
 ) -> None:
@@ -468,29 +425,3 @@ def test_options_of_a_model_may_change(run: Predict) -> None:
     assert "training.steps=77" in of_training
     assert "model.explode_at=3" not in of_training
     assert of_prediction.endswith("model.explode_at=3")
-
-
-def test_models_of_any_size_have_the_same_weights_at_each() -> None:
-    """The shapes of their parameters do not depend on the number of particles."""
-    statistics = {}
-    for name in ("position", "velocity", "acceleration"):
-        statistics[f"{name}_mean"] = (0.5, 0.5)
-        statistics[f"{name}_std"] = (0.5, 0.5)
-    small = replace(INFO, statistics=statistics)
-    large = replace(
-        small,
-        size="full",
-        particles=12,
-        radius=0.05,
-    )
-    Shapes = dict[str, torch.Size]
-
-    def parameter_shapes(model: Any, info: DatasetInfo) -> Shapes:
-        state = model.build({}, info).state_dict()
-        return {name: value.shape for name, value in state.items()}
-
-    for entry in load_all().values():
-        model = entry.model
-        if model.any_size:
-            shapes = parameter_shapes(model, large)
-            assert shapes == parameter_shapes(model, small), model.method

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simple_models import batch, network, rolled
+from simple_models import batch, network
 from torch import Tensor
 
 from lagbench.baselines.relaxation import SHARE, SOFTNESS, Relaxation
-from lagbench.baselines.simulator import ParticleState
 from lagbench.data.box import Box
 from lagbench.tensors import TensorBox
 
@@ -124,53 +123,6 @@ def test_particles_stay_between_walls() -> None:
     assert densities(heap.double(), periodic=False).min() > 35.0
 
 
-def test_a_rollout_with_relaxation_does_not_collapse() -> None:
-    """Particles run to the centre; velocities are those that they really have."""
-    resting = lattice(15).double().numpy()
-    speed = 0.02 * (0.5 - resting)
-    frames = np.stack([resting - speed, resting])
-    given = batch(frames)
-
-    small = {"awake": True, "latent": 8, "layers": 1, "radius": RADIUS}
-    model = network(**small, relaxation=5)
-    free = rolled(network(**small), given, 30)
-    relaxed = rolled(model, given, 30)
-    start = densities(torch.tensor(resting), periodic=False).mean()
-    densest_free = densities(free[:, -1].double(), periodic=False).max()
-    densest_relaxed = densities(relaxed[:, -1].double(), periodic=False).max()
-    assert densest_free > 3.0 * start
-    assert densest_relaxed < 1.6 * start
-
-    state, position = model.advance(model.start(given))
-    for _ in range(15):
-        previous = position
-        state, position = model.advance(state)
-    torch.testing.assert_close(state.velocity[:, -1], position - previous)
-
-
-def test_particles_do_not_enter_an_obstacle() -> None:
-    """They run to the centre, where a disc stands; with and without relaxation."""
-    resting = lattice(15).double().numpy()
-    from_centre = np.linalg.norm(resting - 0.5, axis=1)
-    outside = resting[from_centre > 0.15]
-    speed = 0.02 * (0.5 - outside)
-    disc = torch.tensor([[0.5, 0.5, 0.15]])
-    given = replace(batch(np.stack([outside - speed, outside])), obstacle=disc)
-    for iterations in (0, 5):
-        model = network(
-            awake=True,
-            latent=8,
-            layers=1,
-            radius=RADIUS,
-            relaxation=iterations,
-            obstacle=True,
-        )
-        last = rolled(model, given, 30)[:, -1]
-        assert (last - 0.5).norm(dim=1).min() > 0.15 - 1e-6
-        free = network(awake=True, latent=8, layers=1, radius=RADIUS)
-        assert (rolled(free, given, 30)[:, -1] - 0.5).norm(dim=1).min() < 0.1
-
-
 def test_the_velocity_across_a_periodic_end_is_the_shortest_way() -> None:
     """A heap at the end of a box spreads to both sides."""
     rng = np.random.default_rng(6)
@@ -188,21 +140,3 @@ def test_the_velocity_across_a_periodic_end_is_the_shortest_way() -> None:
     assert (after[:, 0] > 0.5).any()
     assert way.abs().max() > 1e-3
     torch.testing.assert_close(moved.velocity[:, -1], way, atol=1e-6, rtol=0.0)
-
-
-def test_training_sees_relaxed_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The steps of a pushforward are those of a rollout."""
-    counts = []
-    model = network(radius=RADIUS, relaxation=2, pushforward=3)
-    original = model.advance
-
-    def count(state: ParticleState) -> tuple[ParticleState, Tensor]:
-        counts.append(1)
-        return original(state)
-
-    monkeypatch.setattr(model, "advance", count)
-    frames = np.repeat(lattice(6).numpy()[None], model.history + model.future, axis=0)
-    given = batch(frames)
-    for seed in range(6):
-        model(given, torch.Generator().manual_seed(seed))
-    assert len(counts) > 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +9,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from simple_models import (
-    RADIUS,
-    SMALL,
     batch,
     greatest_difference,
     info,
@@ -25,9 +22,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import mirror_batch
-from lagbench.baselines.operators.gns import GNS
-from lagbench.baselines.simulator import GraphNetwork, ParticleState
-from lagbench.errors import UsageError
 
 TARGETS = pytest.mark.parametrize("target", ["acceleration", "velocity"])
 
@@ -182,49 +176,6 @@ def test_windows_side_by_side_do_not_see_each_other() -> None:
     assert_close(together, alone, rtol=0.0, atol=1e-6)
 
 
-def test_two_frames_are_enough_to_start_from() -> None:
-    """The first velocity repeats in place of those before the window."""
-    window = batch(swirl(0, 8))
-    model = network()
-    second_frame = window.position[:, 1]
-    first_velocity = second_frame - window.position[:, 0]
-
-    two_frames = window.part(slice(2))
-    from_two = model.start(two_frames)
-    repeated = first_velocity[:, None].expand(-1, 5, -1)
-    assert torch.equal(from_two.velocity, repeated)
-    assert torch.equal(from_two.position, second_frame)
-
-    four_frames = window.part(slice(4))
-    from_four = model.start(four_frames)
-    velocity = four_frames.position.diff(dim=1)
-    assert torch.equal(from_four.velocity[:, :3], repeated[:, :3])
-    assert torch.equal(from_four.velocity[:, 2:], velocity)
-
-    one_frame = window.part(slice(1))
-    with pytest.raises(UsageError):
-        model.start(one_frame)
-
-
-def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
-    """The oldest velocity leaves and the new one comes last."""
-    window = batch(swirl(0, 7))
-    model = network()
-    first_six = window.part(slice(6))
-    last_six = window.part(slice(1, 7))
-    state = model.start(first_six)
-    next_start = model.start(last_six)
-    last_velocity = next_start.velocity[:, -1]
-    moved = state.move(next_start.position, last_velocity)
-    for field in fields(ParticleState):
-        value = getattr(moved, field.name)
-        expected = getattr(next_start, field.name)
-        if expected is None:
-            assert value is None
-        else:
-            assert torch.equal(value, expected)
-
-
 def test_a_predicted_frame_moves_with_its_own_wall_velocity() -> None:
     """After the last known wall velocity that one stays."""
     window = batch(swirl(0, 8), walls=True)
@@ -265,51 +216,6 @@ def test_a_particle_that_flies_out_stops_at_the_wall() -> None:
     assert y_velocity == pytest.approx(0.001, abs=1e-6)
 
 
-@TARGETS
-def test_no_rollout_leaves_the_box(target: str) -> None:
-    """Whatever a network says: of 256 particles over 30 frames none is outside."""
-    model = network(awake=True, target=target)
-    decoder_bias = model.network.decoder[-1].bias
-    torch.nn.init.normal_(decoder_bias, std=50.0)
-    path = roll_out(model, swirl(0, 6), 30)
-    bounds = torch.tensor(info().bounds)
-    low, high = bounds.T
-    assert bool((path >= low).all())
-    assert bool((path <= high).all())
-    is_stopped = (path == low) | (path == high)
-    assert bool(is_stopped.any())
-
-
-class RecordingNetwork(GraphNetwork):
-    """A graph network that records its inputs and predicts zeros."""
-
-    operator = GNS
-    method = "recording"
-
-    def predict(
-        self, state: ParticleState, *_: object
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Record the state."""
-        earlier_states = getattr(self, "states", [])
-        self.states = [*earlier_states, state]
-        return torch.zeros_like(state.position), {}
-
-
-def test_noise_stays_in_the_box() -> None:
-    """Noise moves particles that rest at a wall to its inner side only."""
-    y = 0.3 + 0.05 * np.arange(8)
-    x = np.full(8, 0.9375)
-    resting = np.stack([x, y], axis=-1)
-    frames = np.repeat(resting[None], 7, axis=0)
-    window = batch(frames)
-    options = SMALL | {"noise_std": 1e-3}
-    model = RecordingNetwork.build(options, info())
-    model(window, seeded())
-    noisy_x = model.states[0].position[:, 0]
-    assert float(noisy_x.max()) == 0.9375
-    assert float(noisy_x.min()) < 0.9375
-
-
 def test_a_wall_passes_gradients_on() -> None:
     """A prediction that a wall stops learns to stop before it, where the truth does."""
     given_x = 0.9275 + 0.002 * np.arange(6)
@@ -328,44 +234,3 @@ def test_a_wall_passes_gradients_on() -> None:
     # multiplied by.
     expected = 2 * 0.0015 / 0.0002
     assert float(gradient[0]) == pytest.approx(expected, rel=1e-3)
-
-
-def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
-    """A change of the wall velocity in an older frame changes nothing."""
-    at_rest = jittered(0)[None]
-    frames = np.repeat(at_rest, 7, axis=0)
-    window = batch(frames, walls=True)
-    model = network(
-        awake=True,
-        layers=1,
-        wall_velocity=True,
-        wall_reach=1.0,
-    )
-
-    def step_with(wall_velocity: Tensor) -> Tensor:
-        forced = replace(window, wall_velocity=wall_velocity)
-        given = forced.part(slice(6))
-        with torch.no_grad():
-            state, _ = model.step(model.start(given))
-        return state.position
-
-    def reverse_walls_at(frame: int) -> Tensor:
-        wall_velocity = window.wall_velocity.clone()
-        wall_velocity[:, frame] *= -3.0
-        return wall_velocity
-
-    position = step_with(window.wall_velocity)
-    older_position = step_with(reverse_walls_at(5))
-    assert torch.equal(older_position, position)
-
-    difference = step_with(reverse_walls_at(6)) - position
-    is_changed = difference.abs().amax(dim=1) > 0
-    low, high = torch.tensor(info().bounds).T
-    last = window.position[:, 5]
-    nearer_wall = torch.minimum(last - low, high - last)
-    wall_distance = nearer_wall.amin(dim=1)
-    is_near = wall_distance < 0.9 * RADIUS
-    is_far = wall_distance > 2.0 * RADIUS
-    assert bool(is_changed[is_near].all())
-    # One layer: a particle hears of the walls of its neighbours at most.
-    assert not bool(is_changed[is_far].any())

@@ -30,7 +30,6 @@ from lagbench.errors import (
     WorkFailedError,
 )
 from lagbench.make.generate import GenerationResult
-from lagbench.submission.budget import Budget, track_of
 from lagbench.work.run import Progress
 
 Run = Callable[..., TrainingResult]
@@ -234,31 +233,6 @@ def test_the_record_counts_the_hours_before_the_start(
     next_budget = load(again.weights).training["budget"]
     assert 2.0 < next_budget["cpu_hours"] < 2.1
     assert next_budget["start_steps"] == 10
-
-
-@pytest.mark.parametrize(
-    ("start_steps", "track"),
-    [
-        (None, "converged"),
-        (2, None),
-        (0, "converged"),
-        (100, None),
-    ],
-)
-def test_steps_before_the_start_count_for_convergence(
-    start_steps: int | None,
-    track: str | None,
-) -> None:
-    """Steps that bring nothing converge only where they are half of all."""
-    flat = Budget(
-        steps=4,
-        epochs=1.0,
-        cpu_hours=9.0,
-        best=0.5,
-        validations=((2, 0.5), (4, 0.5)),
-        start_steps=start_steps,
-    )
-    assert track_of("mini", flat) == track
 
 
 def test_an_interrupted_training_goes_on_with_the_same_bits(

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
-from simple_models import batch, greatest_difference, info, jittered
+from simple_models import greatest_difference, info, jittered
 from torch import Tensor
 
-from lagbench.baselines.augmentation import mirror_batch
-from lagbench.baselines.baseline import Batch
 from lagbench.baselines.particle_grid import ParticleGrid
-from lagbench.baselines.strain import UNIT, RestShape, first_frame
+from lagbench.baselines.strain import UNIT, RestShape
 
 BOUNDS = info().bounds
 
@@ -79,23 +75,3 @@ def test_bodies_in_layers_of_their_own_fly_apart_unstrained() -> None:
     no_strain = torch.zeros_like(one_layer)
     assert greatest_difference(two_layers, no_strain) < 1e-4
     assert greatest_difference(one_layer, no_strain) > 0.1
-
-
-def last_strain(window: Batch) -> Tensor:
-    """Return the strain of the second frame since the first."""
-    shape = rest_shape(first_frame(window))
-    return shape.strain(window.position[:, 1])
-
-
-def test_an_image_is_strained_as_an_image() -> None:
-    """A mirror image in x has the same xx and yy, and the opposite xy."""
-    first = square_body(0)
-    sheared = change_shape(first, [[1.05, 0.0], [0.1, 0.9]])
-    frames = torch.stack([first, sheared])
-    window = replace(batch(frames.numpy()), origin=first)
-    mirror_x = torch.diag(torch.tensor([-1.0, 1.0]))
-    image = mirror_batch(window, mirror_x[None], BOUNDS)
-
-    expected = last_strain(window) * torch.tensor([1.0, -1.0, 1.0])
-    image_strain = last_strain(image)
-    torch.testing.assert_close(image_strain, expected, rtol=0, atol=1e-3)

@@ -71,27 +71,3 @@ def test_wrapped_points_lie_in_the_box_whatever_is_rounded(
     assert bool((x < end).all())
     # Between walls nothing is wrapped.
     assert torch.equal(y, position[:, 1])
-
-
-def test_between_walls_the_bits_are_those_of_a_clamp_and_a_difference() -> None:
-    box = TensorBox(WALLED)
-    start = draw_points(WALLED, 3).float()
-    end = draw_points(WALLED, 4).float()
-    low, high = start.new_tensor(WALLED.bounds).T
-    way = box.displacement(start, end)
-    assert torch.equal(way, end - start)
-    inside = box.inside(start)
-    assert torch.equal(inside, start.clamp(low, high))
-    velocity = box.stop_at_walls(start, end)
-    expected = end.clamp(low - start, high - start)
-    assert torch.equal(velocity, expected)
-
-
-@EVERY_BOX
-def test_gradients_are_those_of_a_difference(box: Box) -> None:
-    start = draw_points(box, 5)
-    end = draw_points(box, 6).requires_grad_()
-    way = TensorBox(box).displacement(start, end)
-    way.sum().backward()
-    assert end.grad is not None
-    assert bool((end.grad == 1.0).all())

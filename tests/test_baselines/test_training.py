@@ -28,7 +28,6 @@ from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.train import (
     StepBatches,
     TrainingResult,
-    train,
 )
 from lagbench.data.registry import Registry
 from lagbench.errors import (
@@ -425,16 +424,6 @@ def test_batches_are_the_same_from_any_step(
         assert resumed == batches[first:]
 
 
-@pytest.mark.parametrize("ranks", [1, 3])
-def test_an_epoch_of_batches_has_no_window_twice(
-    data: WindowDataset, ranks: int
-) -> None:
-    for rank in range(ranks):
-        batches = draw_batches(data, rank=rank, ranks=ranks)
-        windows = list(chain.from_iterable(batches))[: len(data) // ranks]
-        assert len(set(windows)) == len(windows)
-
-
 def draw_openings(data: WindowDataset, **ranks: int) -> list[int]:
     """Return the windows of all steps that an opening share has exchanged."""
     plain = chain.from_iterable(draw_batches(data, **ranks))
@@ -459,13 +448,6 @@ def test_a_share_of_the_windows_are_openings(data: WindowDataset, ranks: int) ->
         assert scenarios == set(data.scenarios)
         draws.add(tuple(openings))
     assert len(draws) == ranks
-
-
-@pytest.mark.parametrize("split", ["fluid", "multimaterial"])
-def test_gravity_allows_no_square_of_images(split: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError) as caught:
-        train("gns", split, "tiny", root=tmp_path, settings=("model.symmetry=square",))
-    assert caught.value.where == "model.symmetry"
 
 
 class FittedDrift(Drift):
