@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from importlib.resources import files
 
 from lagbench.data.manifest import FileEntry, Manifest
 from lagbench.data.registry import Size, Split
@@ -20,55 +21,6 @@ KEYWORDS = (
     "surrogate model",
     "computational fluid dynamics",
 )
-
-# terms that Croissant adds to schema.org under their own names
-_TERMS = (
-    "arrayShape",
-    "citeAs",
-    "column",
-    "containedIn",
-    "equivalentProperty",
-    "extract",
-    "field",
-    "fileObject",
-    "fileProperty",
-    "fileSet",
-    "format",
-    "includes",
-    "isArray",
-    "isLiveDataset",
-    "jsonPath",
-    "key",
-    "md5",
-    "parentField",
-    "path",
-    "recordSet",
-    "references",
-    "regex",
-    "repeated",
-    "replace",
-    "samplingRate",
-    "separator",
-    "source",
-    "subField",
-    "transform",
-)
-
-_CONTEXT: Mapping[str, object] = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "description": {"@container": "@language"},
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    "name": {"@container": "@language"},
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "sc": "https://schema.org/",
-    **{term: f"cr:{term}" for term in _TERMS},
-}
 
 # columns of the record set: name, and (type, description)
 _FIELDS: Mapping[str, tuple[str, str]] = {
@@ -83,8 +35,10 @@ _FIELDS: Mapping[str, tuple[str, str]] = {
 
 def croissant_json(size: Size, split: Split, manifest: Manifest) -> str:
     """Return the Croissant document of a data set folder."""
+    # that of the specification
+    context = files("lagbench.make") / "croissant_context.json"
     document = {
-        "@context": dict(_CONTEXT),
+        "@context": json.loads(context.read_text("utf-8")),
         "@type": "sc:Dataset",
         "name": f"lagbench-{size.split}-{size.name}",
         "description": f"{split.title}, size {size.name}. {split.description}",
