@@ -1,7 +1,7 @@
 # docker build -t lagbench . && docker run --rm -v "$PWD/demo:/lagbench/demo" lagbench
 FROM debian:bookworm-slim
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends ca-certificates make python3-venv \
+    && apt-get install --yes --no-install-recommends ca-certificates libx11-6 make python3-venv \
     && rm -rf /var/lib/apt/lists/*
 WORKDIR /lagbench
 COPY . .
