@@ -27,6 +27,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lagbench.data import WALL
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError
 from lagbench.tensors import Batch, TensorBox
@@ -414,5 +415,8 @@ def augment(
             by_particle = share[batch.sample.to(device)]
             deviation = noise_std * by_particle[:, None, None]
         position = add_walk_noise(batch.position, model.history, deviation, generator)
+        if model.info.wall_particles:
+            is_wall = (batch.material == WALL)[:, None, None]
+            position = torch.where(is_wall, batch.position, position)
         batch = replace(batch, position=position)
     return batch

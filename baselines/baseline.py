@@ -75,6 +75,8 @@ class Baseline(nn.Module):
             window of all frames, with what its file states beside the positions. The
             method sets buffers of the model and returns numbers to log, by name.
             Nothing calls :meth:`forward`.
+        knows_wall_particles: whether the model holds particles of the material ``wall``
+            at their places. Others refuse such data.
 
     Args:
         options: the model's options.
@@ -87,10 +89,18 @@ class Baseline(nn.Module):
     any_box: ClassVar[bool] = False
     computes_on_cpu: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
+    knows_wall_particles: ClassVar[bool] = False
 
     def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()
         self._check_box(info.box, where=f"the box of {info.split} {info.size}")
+        if info.wall_particles and not self.knows_wall_particles:
+            raise UsageError(
+                f"{self.method} knows no particles of walls; train neuralmpm or a "
+                "graph network such as gns, or import the data without them: --kinds "
+                "KIND=drop",
+                where=f"{info.split} {info.size}",
+            )
         self.options = options
         self.info = info
         self.box = TensorBox(info.box)
@@ -283,6 +293,7 @@ class DatasetInfo:
     # for each axis
     statistics: Mapping[str, tuple[Finite, ...]]
     periodic: tuple[str, ...] = ()  # names of the axes that have no walls
+    wall_particles: bool = False  # whether walls are particles too
 
     @property
     def box(self) -> Box:

@@ -123,10 +123,13 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         UsageError: a weight is no dense tensor of real numbers.
         WorkFailedError: the disk is full, or nobody may write there.
     """
+    facts = asdict(checkpoint.info)
+    if not checkpoint.info.wall_particles:
+        del facts["wall_particles"]
     header = {
         "baseline": checkpoint.baseline,
         "options": dict(checkpoint.options),
-        "facts": asdict(checkpoint.info),
+        "facts": facts,
         "training": dict(checkpoint.training),
     }
     tensors = dict(checkpoint.weights)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lagbench.data import WALL
 from lagbench.data.box import parse_obstacle
 from lagbench.data.layout import dataset_folder, has_file
 from lagbench.data.local import locate, suggest_repair
@@ -60,6 +61,7 @@ def read_dataset_info(
     update_working_copy(tier, root_folder, [first_file.scenario])
     with read_scenario(folder / first_file.path) as file:
         moving_walls = "wall_velocity" in file.variables
+        wall_particles = bool((file.read("material") == WALL).any())
 
     task = tier.task
     return DatasetInfo(
@@ -77,6 +79,7 @@ def read_dataset_info(
         score_placement=task.score_grid.placement,
         frame_interval=tier.frame_interval,
         moving_walls=moving_walls,
+        wall_particles=wall_particles,
         statistics=rows,
     )
 

@@ -203,6 +203,7 @@ class NodeFeatures(nn.Module):
         velocities: int = 5,
         moving_walls: bool = False,
         periodic: Sequence[bool] = (False, False, False),
+        wall_particles: bool = False,
     ) -> None:
         super().__init__()
         self.dimension = len(bounds)
@@ -213,7 +214,7 @@ class NodeFeatures(nn.Module):
         self.bounds = bounds  # of the box, (low, high) along each axis [length]
         self.reach = reach  # how far a particle sees a wall [length]
         self.moving_walls = moving_walls  # whether wall velocities are features too
-        self.embedding = nn.Embedding(MATERIALS, EMBEDDING)
+        self.embedding = nn.Embedding(MATERIALS + wall_particles, EMBEDDING)
 
     @property
     def count(self) -> int:

@@ -21,6 +21,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lagbench.data import WALL
 from lagbench.errors import DataError
 
 from .augmentation import (
@@ -54,6 +55,7 @@ class NeuralMPM(Baseline):
     method = "NeuralMPM"
     any_size = True
     any_box = True
+    knows_wall_particles = True
 
     def __init__(self, options: NeuralMPMOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
@@ -222,6 +224,8 @@ class NeuralMPM(Baseline):
             body_force=force,
             rest_shape=rest_shape,
         )
+        if self.info.wall_particles:
+            state = replace(state, is_wall=(given.material == WALL)[:, None])
         if self.context is not None:
             context = self._encode_context(state, self.context, average=average)
             state = replace(state, context=context)
@@ -360,6 +364,9 @@ class NeuralMPM(Baseline):
             moved = position + velocity
             # The sum may round to a number beyond the wall.
             position = self.box.inside(moved)
+            if state.is_wall is not None:
+                velocity = torch.where(state.is_wall, 0.0, velocity)
+                position = torch.where(state.is_wall, state.position, position)
             grid_velocity = grid_velocity + acceleration
             frames.append((position, velocity))
         return frames

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from lagbench.data import PARTICLE_KINDS
 from lagbench.errors import DataError
 
 from .augmentation import strain_matrix, wall_permutation
-from .graph import MATERIALS
 from .neuralmpm_options import NeuralMPMOptions
 from .particle_grid import ParticleGrid, Stencil
 from .strain import RestShape
@@ -48,6 +48,7 @@ class GridState:
     # frame, layer, axis]; None where the U-Net does not see it
     body_force: Tensor | None = None
     rest_shape: RestShape | None = None  # None where strain is not asked for
+    is_wall: Tensor | None = None  # [particle, 1]; None where walls are no particles
     coming: tuple[Tensor, ...] = ()  # predicted positions of the frames to come
 
 
@@ -84,7 +85,7 @@ class FieldEncoder(nn.Module):
         self.acceleration_std = acceleration_std
         self.material_count = len(options.materials)
 
-        slot = torch.full((MATERIALS,), -1)
+        slot = torch.full((len(PARTICLE_KINDS),), -1)
         slots = torch.arange(self.material_count)
         slot[list(options.materials)] = slots
         reach = REACH * grid.spacing

@@ -7,11 +7,11 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from lagbench.data import PARTICLE_KINDS
 from lagbench.errors import UsageError
 
 from .augmentation import Symmetry
 from .baseline import DatasetInfo, Options, check_moving_walls
-from .graph import MATERIALS
 
 
 class NeuralMPMOptions(Options):
@@ -84,10 +84,13 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
         )
     materials = set(options.materials)
     is_repeated = len(materials) < len(options.materials)
-    if not materials or is_repeated or not materials <= set(range(MATERIALS)):
+    if info.wall_particles and (options.shape or options.density):
+        raise UsageError("model.shape and model.density know no particles of walls")
+    numbers = range(len(PARTICLE_KINDS))
+    if not materials or is_repeated or not materials <= set(numbers):
         raise UsageError(
             f"model.materials={list(options.materials)}; name some of "
-            f"{list(range(MATERIALS))}, each once"
+            f"{list(numbers)}, each once"
         )
     if options.average and options.symmetry is Symmetry.NONE:
         raise UsageError(

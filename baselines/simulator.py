@@ -28,6 +28,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator
+from lagbench.data import WALL
 from lagbench.data.grid import COUNTED_SHARE, EMPTY_SHARE
 from lagbench.errors import UsageError
 
@@ -285,6 +286,7 @@ class GraphNetwork(Baseline):
     options: GraphNetworkOptions
     any_size = True
     any_box = True
+    knows_wall_particles = True
     operator: ClassVar[type[Operator]]
 
     def __init__(self, options: GraphNetworkOptions, info: DatasetInfo) -> None:
@@ -308,6 +310,7 @@ class GraphNetwork(Baseline):
             velocities=options.velocities,
             moving_walls=options.wall_velocity,
             periodic=info.box.periodic,
+            wall_particles=info.wall_particles,
         )
         self.forcing = ForcingFeatures(
             info,
@@ -570,6 +573,8 @@ class GraphNetwork(Baseline):
         correction = self.box.displacement(following.position, position)
         velocity = following.velocity.clone()
         velocity[:, -1] += correction
+        held = self._hold_walls(state, position, velocity[:, -1])
+        position, velocity[:, -1] = held
         following = replace(
             following, position=position, velocity=velocity, density_limit=limit
         )
@@ -600,7 +605,20 @@ class GraphNetwork(Baseline):
             inside = self._keep_outside(inside, own_obstacle)
         correction = self.box.displacement(position, inside)
         velocity = velocity + correction.detach()
+        inside, velocity = self._hold_walls(state, inside, velocity)
         return state.move(inside, velocity), losses
+
+    def _hold_walls(
+        self, state: ParticleState, position: Tensor, velocity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return positions and velocities, those of walls as they were and zero."""
+        if not self.info.wall_particles:
+            return position, velocity
+        is_wall = (state.material == WALL)[:, None]
+        return (
+            torch.where(is_wall, state.position, position),
+            torch.where(is_wall, 0.0, velocity),
+        )
 
     def find_edges(self, state: ParticleState) -> Tensor:
         """Return senders and receivers of neighbours, int64, shape [2, edge]."""

@@ -99,6 +99,7 @@ def judge_trajectory(
     *,
     box: Box | None = None,
     frame_interval: float = 1.0,
+    is_wall: NDArray[np.bool_] | None = None,
 ) -> Judgement:
     """Refuse frames that are no trajectory of the same particles.
 
@@ -107,17 +108,19 @@ def judge_trajectory(
         frames: positions [length] and velocities [length/s] or None, [particle, axis].
         box: where it repeats itself; walls all around when None.
         frame_interval: time between two frames [s].
+        is_wall: particles that stand still, whose motion is not judged; none when None.
 
     Raises:
         DataError: a position is missing, particles are padding or blown up, rows change
             their order, frames are missing or there twice, periods are not those of
             the jumps, or velocities contradict the motion.
     """
-    motion = _Motion(name)
     moments = []
     shapes = []
     sides = []
+    extents = []
     before = None
+    walls = None
     for number, (raw_position, velocity) in enumerate(frames):
         position = raw_position.astype(np.float64)
         where = f"{name}, frame {number}"
@@ -127,20 +130,28 @@ def judge_trajectory(
             box = unit_box(position.shape[1])
         if number == 0:
             _refuse_lone_particle(position, where)
+            if is_wall is None:
+                is_wall = np.zeros(len(position), bool)
+            motion = _Motion(name, np.flatnonzero(~is_wall))
+            walls = position[is_wall]
         sides.append((position.min(axis=0), position.max(axis=0)))
+        _refuse_moving_walls(position, walls, is_wall, where)
+        position = position[~is_wall]
+        velocity = None if velocity is None else velocity[~is_wall]
+        extents.append(np.ptp(position, axis=0).max())
         moments.append(_moments(position))
         step = 0.0 * position if before is None else box.displacement(before, position)
         shapes.append(_shape(position, step))
         before = position
         motion.add(position, velocity, box)
     low, high = np.array(sides).transpose(1, 0, 2)
-    _refuse_blow_up(name, (high - low).max(axis=1))
+    _refuse_blow_up(name, np.array(extents))
     motion.refuse_reordered_rows()
     motion.refuse_uneven_frames()
     motion.refuse_jumps(box or unit_box(2))
     motion.refuse_velocities(frame_interval)
     notes = [
-        *motion.describe_resolution(raw_position),
+        *motion.describe_resolution(raw_position[~is_wall]),
         *motion.describe_rest(),
         *motion.describe_unmoved(position),
     ]
@@ -203,6 +214,19 @@ def _refuse_lone_particle(position: Floats, where: str) -> None:
     )
 
 
+def _refuse_moving_walls(
+    position: Floats, walls: Floats, is_wall: NDArray[np.bool_], where: str
+) -> None:
+    has_moved = (position[is_wall] != walls).any(axis=1)
+    if has_moved.any():
+        raise DataError(
+            f"{where}: particle {np.flatnonzero(is_wall)[np.argmax(has_moved)]} moves, "
+            f"as {np.count_nonzero(has_moved)} of {len(walls)} particles of the kind "
+            "wall; walls of particles stand still: leave these out (--kinds "
+            "KIND=drop), or give them another kind"
+        )
+
+
 def _refuse_blow_up(name: str, extents: Floats) -> None:
     usual = float(np.quantile(extents, 0.25))
     is_far = extents > FAR * usual
@@ -240,8 +264,9 @@ def _shape(position: Floats, step: Floats) -> Floats:
 class _Motion:
     """The steps of some particles of a trajectory, and the jumps of all."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, numbers: NDArray[np.intp]) -> None:
         self.name = name
+        self.numbers = numbers  # of the particles in the file
         self.samples = np.zeros(0, int)  # numbers of the particles
         self.before: Floats = np.zeros(0)  # positions in the frame before
         self.is_unmoved: NDArray[np.bool_] = np.zeros(0, bool)
@@ -353,10 +378,11 @@ class _Motion:
         frame = int(np.argmax(share > MOST_STRANGE))
         if share[frame] > MOST_STRANGE:
             sample = int(np.argmax(is_strange[frame]))
+            particle = self.numbers[self.samples[sample]]
             raise DataError(
                 f"{self.name}, frame {frame + 1}: {share[frame]:.0%} of the particles "
                 "move farther than the way to their nearest neighbour, as particle "
-                f"{self.samples[sample]} ({lengths[frame, sample]:.3g}, neighbour at "
+                f"{particle} ({lengths[frame, sample]:.3g}, neighbour at "
                 f"{gaps[frame, sample]:.3g}): rows change their order from frame to "
                 "frame, or the axes have another order; order rows by particle "
                 "(an array id does it), or state --axes"
@@ -547,10 +573,11 @@ class _Motion:
         if not len(unmoved) or self.is_unmoved.all():
             return []
         place = np.round(last[unmoved[0]], 6).tolist()
+        particle = self.numbers[unmoved[0]]
         return [
             f"{self.name}: {len(unmoved)} of {len(last)} particles never move, as "
-            f"particle {unmoved[0]} at {place}: leave them out if they are padding; "
-            "give them the kind wall if they are one"
+            f"particle {particle} at {place}: leave them out if they are padding; give "
+            "them the kind wall if they are one"
         ]
 
     def describe_rest(self) -> list[str]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import LIMIT_FIXES, DataError, LagbenchError, WorkFailedError
 
-from . import MATERIALS
+from . import PARTICLE_KINDS
 from .checksums import ContentHasher
 from .hdf5 import (
     DEFLATE_RATIO,
@@ -278,7 +278,10 @@ class ScenarioFile:
             with _damage_errors(self.path, name):
                 attributes = read_attributes(variable)
                 dims = list_dimensions(variable, name)
-                expected = expected_attributes(name, dims)
+                meanings = str(attributes.get("flag_meanings", "")).split()
+                expected = expected_attributes(
+                    name, dims, has_wall_particles=PARTICLE_KINDS[-1] in meanings
+                )
             differing = list_differing_attributes(expected, attributes)
             if differing:
                 values = []
@@ -558,11 +561,11 @@ def require_known_material(material: NDArray[Any], *, where: str, fix: str) -> N
     Raises:
         DataError: there is such a number.
     """
-    is_known = np.isin(material, range(len(MATERIALS)))
+    is_known = np.isin(material, range(len(PARTICLE_KINDS)))
     if not is_known.all():
         raise DataError(
             f"a particle has an unknown material: got {material[~is_known][0]}, "
-            f"expected whole numbers from 0 to {len(MATERIALS) - 1}; {fix}",
+            f"expected whole numbers from 0 to {len(PARTICLE_KINDS) - 1}; {fix}",
             where=f"{where}, variable 'material'",
         )
 

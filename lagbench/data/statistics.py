@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import DataError
 
+from . import WALL
 from .box import UNIT_SQUARE, Box
 from .checksums import round_digits
 from .scenario import ScenarioFile, read_scenario
@@ -145,9 +146,10 @@ def file_moments(
 
 
 def _read_frames(file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
-    """Yield the positions of every frame, shape [particle, space]."""
+    """Yield the positions of every frame without walls, shape [particle, space]."""
+    is_scored = file.read("material") != WALL
     for block in file.blocks("position"):
-        yield from block
+        yield from block if is_scored.all() else block[:, is_scored]
 
 
 def _sum_columns(

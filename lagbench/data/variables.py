@@ -18,7 +18,7 @@ import numpy as np
 
 from lagbench.errors import DataError
 
-from . import MATERIALS
+from . import MATERIALS, PARTICLE_KINDS
 from .hdf5 import HIDDEN_ATTRIBUTES, to_plain
 
 if TYPE_CHECKING:
@@ -128,9 +128,14 @@ These are two for each of ten million particles, or three for each of 6.7 millio
 """
 
 
-def expected_attributes(name: str, dims: Sequence[str]) -> dict[str, object]:
+def expected_attributes(
+    name: str, dims: Sequence[str], *, has_wall_particles: bool = False
+) -> dict[str, object]:
     """Return the attributes that a variable is written with."""
     attributes = dict(ATTRIBUTES[name])
+    if name == "material" and has_wall_particles:
+        attributes["flag_values"] = np.arange(len(PARTICLE_KINDS), dtype=np.int8)
+        attributes["flag_meanings"] = " ".join(PARTICLE_KINDS)
     # xarray makes a coordinate only of what the CF attribute `coordinates` names.
     if "frame" in dims and len(dims) > 1:
         attributes["coordinates"] = "time"

@@ -29,7 +29,7 @@ from lagbench.errors import (
     WorkFailedError,
 )
 
-from . import MATERIALS
+from . import PARTICLE_KINDS, WALL
 from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher
 from .field_errors import describe_value
@@ -70,7 +70,7 @@ class ScenarioWriter:
         particles: particles in every frame.
         frames: frames that will be appended.
         frame_interval: time between frames [s].
-        material: value of :data:`lagbench.data.MATERIALS` for each particle, shape
+        material: value of :data:`lagbench.data.PARTICLE_KINDS` for each particle, shape
             [particle].
         particle_mass: mass of a particle, rho L^d / n.
         wall_velocity: [length/s], shape [wall, axis] (constant) or [frame, wall, axis],
@@ -323,7 +323,8 @@ class ScenarioWriter:
                 fill_value=False,
                 chunk_cache=CHUNK_CACHE,
             )
-        variable.setncatts(expected_attributes(name, dims))
+        has_wall = bool((self._constants["material"][1] == WALL).any())
+        variable.setncatts(expected_attributes(name, dims, has_wall_particles=has_wall))
         self._hasher.declare(name, dtype, dims, shape)
 
 
@@ -349,12 +350,12 @@ def _check_material(
             where=where,
         )
     # before the cast, which wraps
-    is_known = np.isin(numbers, range(len(MATERIALS)))
+    is_known = np.isin(numbers, range(len(PARTICLE_KINDS)))
     if not is_known.all():
         raise DataError(
             f"a particle has an unknown material: got {numbers[~is_known][0]}, "
-            f"expected whole numbers from 0 to {len(MATERIALS) - 1}; give the numbers "
-            "of lagbench.data.MATERIALS",
+            f"expected whole numbers from 0 to {len(PARTICLE_KINDS) - 1}; give the "
+            "numbers of lagbench.data.PARTICLE_KINDS",
             where=where,
         )
     return numbers.astype(np.int8)

@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from pydantic import ValidationError
 
+from lagbench.data import WALL
 from lagbench.data.box import AXES, Box
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.judgement import Judgement, find_shared_frames, judge_trajectory
@@ -71,6 +72,7 @@ class _Judged:
     frames: int
     states_kinds: bool  # whether the file says which materials there are
     has_velocity: bool
+    has_walls: bool  # whether some particles are walls
     stated: Mapping[str, Any]  # options that the file states
 
 
@@ -90,9 +92,9 @@ def adopt(
 
     A dataset has the dimensions time, particle and space and the variable ``position``;
     where it has them, ``velocity`` of the same shape, ``time`` [s, or its unit],
-    ``material`` [particle] (0 liquid, 1 jelly, 2 snow, 3 rope), ``id`` [particle] or
-    [time, particle], which orders the rows, and ``wall_velocity`` [wall, axis] or
-    [time, wall, axis]. docs/exchange.md has the formats.
+    ``material`` [particle] (0 liquid, 1 jelly, 2 snow, 3 rope, 4 wall), ``id``
+    [particle] or [time, particle], which orders the rows, and ``wall_velocity`` [wall,
+    axis] or [time, wall, axis]. docs/exchange.md has the formats.
 
     Args:
         sources: a folder with subfolders, or files, ``train``, ``valid`` and ``test``;
@@ -308,8 +310,15 @@ def _judge(
         )
     stated = _select_axes(_with_file_box(description, trajectory), trajectory)
     with closing(trajectory):
+        is_wall = trajectory.material == WALL
+        if is_wall.all():
+            raise DataError(f"{name}: all particles are walls; give one another kind")
         judgement = judge_trajectory(
-            name, trajectory.read(), box=stated.box, frame_interval=interval
+            name,
+            trajectory.read(),
+            box=stated.box,
+            frame_interval=interval,
+            is_wall=is_wall,
         )
         first_frame, _ = next(trajectory.read())
     box = stated.box or _box_around([judgement])
@@ -317,7 +326,8 @@ def _judge(
     return _Judged(
         open=open_trajectory,
         judgement=judgement,
-        spacing=estimate_spacing(first_frame, box, where=f"{name}, frame 0"),
+        spacing=estimate_spacing(first_frame[~is_wall], box, where=f"{name}, frame 0"),
+        has_walls=bool(is_wall.any()),
         interval=interval,
         particles=len(trajectory.material),
         axes=trajectory.axes,
@@ -412,6 +422,8 @@ def _complete(
             differing = f"the dimensions {first.axes} and {member.axes}"
         elif member.stated != first.stated:
             differing = f"the boxes {first.stated} and {member.stated}"
+        elif member.has_walls != first.has_walls:
+            differing = "particles of walls in one of them only"
         elif member.states_kinds != first.states_kinds:
             differing = "materials in one of them only"
         elif not math.isclose(member.interval, first.interval, rel_tol=0.01):

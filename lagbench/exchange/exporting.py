@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
-from lagbench.data import MATERIALS
+from lagbench.data import PARTICLE_KINDS
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.layout import expand_path
 from lagbench.data.local import locate, suggest_repair
@@ -264,7 +264,7 @@ def _read_runs(
     count: Callable[[], None],
 ) -> Iterator[Run]:
     """Yield the trajectories of a subset."""
-    numbers = np.array([module.KINDS[name] for name in MATERIALS])
+    numbers = np.array([module.KINDS[name] for name in PARTICLE_KINDS])
     for path in paths:
         with read_scenario(path) as file:
             position = file.read("position")

@@ -24,7 +24,7 @@ from lagbench.errors import UnreadableFileError
 JOINT = "gns_data"
 """Key under which some files hold all trajectories together."""
 
-KINDS = {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8}
+KINDS = {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8, "wall": 3}
 """Number of each material."""
 
 WALLS = (3, 3)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 
-KINDS = {"liquid": 0, "jelly": 4, "snow": 5, "rope": 6}
+KINDS = {"liquid": 0, "jelly": 4, "snow": 5, "rope": 6, "wall": 1}
 """Number of each material."""
 
 WALLS = (1, 2)

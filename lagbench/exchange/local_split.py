@@ -21,6 +21,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from lagbench.atomic import check_writable, temporary_name, write_atomically
+from lagbench.data import WALL
 from lagbench.data.box import AXES, SMALL_SIDE, Box, parse_periodic
 from lagbench.data.checksums import HASHED_SUBSETS, round_digits
 from lagbench.data.grid import Placement, most_cells
@@ -524,7 +525,9 @@ class _Writer:
                 continue
             key = self._key(entry.scenario, "test")
             with read_scenario(scenario_path(self.root, key)) as file:
+                is_scored = file.read("material") != WALL
                 for frame in frames:
                     position = file.read("position", slice(frame, frame + 1))[0]
+                    position = position[is_scored]
                     area = len(position) * spacing**self.box.dimension
                     yield Cloud(position, area)

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from lagbench.data import MATERIALS
+from lagbench.data import PARTICLE_KINDS, WALL
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
 from .readers import reading
@@ -378,9 +378,9 @@ def _find_materials(
     materials = {
         str(kind): word for kind, word in dataset.attrs.get("kinds", {}).items()
     }
-    materials |= {material: material for material in MATERIALS}
+    materials |= {material: material for material in PARTICLE_KINDS}
     if variable.lower() == "material":
-        for number, material in enumerate(MATERIALS):
+        for number, material in enumerate(PARTICLE_KINDS):
             materials.setdefault(str(number), material)
     if "kinds" in dataset.attrs:
         materials["-1"] = DROP  # padding
@@ -392,11 +392,11 @@ def _find_materials(
             every = ", ".join(map(str, np.unique(values)[:10]))
             raise UsageError(
                 f"{name}: {variable} has the kinds {every}, and no material is known "
-                f"for {value}; state it, as in --kinds {value}={MATERIALS[0]}, or "
-                f"leave these particles out (walls, which models see as bounds only): "
-                f"--kinds {value}={DROP}"
+                f"for {value}; state it, as in --kinds {value}={PARTICLE_KINDS[0]}, or "
+                f"{value}={PARTICLE_KINDS[WALL]} for a fixed wall, or leave these "
+                f"particles out: --kinds {value}={DROP}"
             )
-        code = -1 if word == DROP else MATERIALS.index(word)
+        code = -1 if word == DROP else PARTICLE_KINDS.index(word)
         codes[values == value] = code
     is_kept = codes >= 0
     if not is_kept.any():
@@ -421,10 +421,10 @@ def parse_kinds(kinds: Mapping[Any, str] | str | None) -> dict[str, str]:
         kinds = {kind.strip(): word.strip() for kind, word in pairs}
     checked = {}
     for kind, word in (kinds or {}).items():
-        if word not in (*MATERIALS, DROP):
+        if word not in (*PARTICLE_KINDS, DROP):
             raise UsageError(
                 f"--kinds: {word!r} is no material; write KIND=MATERIAL, as in "
-                f"3=jelly,0=drop, where materials are {', '.join(MATERIALS)}"
+                f"3=jelly,0=drop, where materials are {', '.join(PARTICLE_KINDS)}"
             )
         checked[str(kind)] = word
     return checked

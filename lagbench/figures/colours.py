@@ -16,7 +16,7 @@ WALL = "#d5d9e0"  # walls at rest
 MOVING = "#d55e00"  # moving walls: vermilion, which jelly has too; no split has both
 
 # liquid, jelly, snow, rope: blue, vermilion, sky blue, orange
-MATERIAL_COLOURS = ("#0072b2", "#d55e00", "#56b4e9", "#e69f00")
+MATERIAL_COLOURS = ("#0072b2", "#d55e00", "#56b4e9", "#e69f00", "#8a8a8a")
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#c2659a", "#d18f00", "#3f9fd8")
 """Series of a chart."""

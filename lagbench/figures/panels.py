@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data import MATERIALS
+from lagbench.data import PARTICLE_KINDS
 from lagbench.errors import require
 
 from .canvas import build_speed_map, build_vorticity_map
@@ -543,7 +543,7 @@ def draw_material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
     handles = []
     for material in np.unique(materials):
         colour = MATERIAL_COLOURS[material]
-        name = MATERIALS[material]
+        name = PARTICLE_KINDS[material]
         handles += axes.plot(
             [],
             [],

@@ -316,6 +316,8 @@ class Scenario:
     material: NDArray[np.integer]
     particle_mass: float  # of every particle [mass]
     area: float  # that the particles cover at first [length^2]
+    # rows of a file's frames that are scored; None: all
+    scored: NDArray[np.intp] | None = None
     # predicted frames until the truth rests; None: the whole horizon
     active_frames: int | None = None
 
@@ -373,6 +375,13 @@ class Scenario:
                     self.config.radius, first[particles], self.config.box
                 )
         return bonds
+
+    def select(self, position: ArrayLike) -> NDArray[np.floating]:
+        """Return the particles of a frame that are scored: those of walls are not."""
+        rows = np.asarray(position)
+        if self.scored is None or len(rows) == len(self.material):
+            return rows
+        return rows[self.scored]
 
     def snapshot(self, position: ArrayLike, previous: ArrayLike) -> Snapshot:
         """Return the snapshot of a frame from its positions and those one frame before.
@@ -438,7 +447,7 @@ def snapshots(
         before = previous
 
     for position in positions:
-        snapshot = scenario.snapshot(position, before)
+        snapshot = scenario.snapshot(scenario.select(position), before)
         yield snapshot
         before = snapshot.position
 

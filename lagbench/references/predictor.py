@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data import WALL
 from lagbench.data.box import Box, keep_outside, parse_obstacle
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
@@ -192,14 +193,18 @@ def falls(size: Size) -> bool:
 
 
 def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
-    """Return what a scenario's file gives to a model."""
+    """Return what a scenario's file gives to a model, without particles of walls."""
     task = size.task
     material = file.read("material")
+    position = file.read("position", slice(0, task.input_frames))
+    if (material == WALL).any():
+        position = position[:, material != WALL]
+        material = material[material != WALL]
     mass = float(file.read("particle_mass")) * len(material)
     return Given(
         size=size,
         root=root,
-        position=file.read("position", slice(0, task.input_frames)).astype(np.float64),
+        position=position.astype(np.float64),
         material=material,
         walls=wall_motion(file, size, task.input_frames + task.horizon),
         body_force=_body_force(file, size),

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data import MATERIALS
+from lagbench.data import MATERIALS, WALL
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Size
@@ -95,14 +95,20 @@ class ScoredTask:
         """Yield a scenario while its file is open."""
         with self.truth.open(scenario) as file:
             material = file.read("material")
+            scored = None
+            if (material == WALL).any():
+                scored = np.flatnonzero(material != WALL)
+                material = material[scored]
             mass = file.read_particle_mass()
             input_frames = slice(0, self.config.input_frames)
+            given = file.read("position", input_frames)
             properties = Scenario(
                 config=self.config,
-                input_positions=file.read("position", input_frames),
+                input_positions=given if scored is None else given[:, scored],
                 material=material,
                 particle_mass=mass,
                 area=mass * len(material) / self.density,
+                scored=scored,
                 active_frames=_active_frames(file),
             )
             yield OpenScenario(properties, file)

@@ -314,7 +314,7 @@ def _read_pairs(
     """Return truth and prediction of each entry at a frame."""
     scenario = truth.scenario
     before, now = truth.file.read("position", slice(frame - 1, frame + 1))
-    true_snapshot = scenario.snapshot(now, before)
+    true_snapshot = scenario.snapshot(scenario.select(now), scenario.select(before))
     pairs = []
     for file in files:
         is_first_predicted = frame == scenario.config.input_frames
@@ -323,7 +323,9 @@ def _read_pairs(
             now = file.frames(number, frame, 1)[0]
         else:
             before, now = file.frames(number, frame - 1, 2)
-        predicted_snapshot = scenario.snapshot(now, before)
+        predicted_snapshot = scenario.snapshot(
+            scenario.select(now), scenario.select(before)
+        )
         pairs.append(FramePair(scenario, frame, true_snapshot, predicted_snapshot))
     return tuple(pairs)
 
