@@ -33,7 +33,8 @@ def save_lagrangebench(folder: Path, *, wall_kind: int = 1, moves: float = 0.0) 
         floor = np.tile(FLOOR, (16, 1, 1))
         floor[8:] += moves
         with h5py.File(folder / f"{name}.h5", "w") as file:
-            file["00000/position"] = np.concatenate([floor, vortex(seed)], 1, "f4")
+            position = np.concatenate([floor, vortex(seed)], axis=1)
+            file["00000/position"] = position.astype("f4")
             kinds = np.repeat([wall_kind, 0], [len(FLOOR), 144])
             file["00000/particle_type"] = kinds
     metadata = {
