@@ -37,11 +37,11 @@ def export_command(
 ) -> None:
     """Write a split in the file format of another code base.
 
-    The folder holds the subsets train, valid and test, and a file of metadata.
+    The folder holds the subsets train, valid and test.
 
     Args:
         split: Name of the split, or folder of a local one.
-        file_format: gns-npz or lagrangebench-h5.
+        file_format: gns-npz, lagrangebench-h5, or vtkhdf for ParaView.
         output: Folder of the new files; by default SPLIT-SIZE-FORMAT here.
         from_walls: For lagrangebench-h5: the origin of the positions is the corner of
             the lower walls, or that of the unit box, as in lagbench. Default: the walls

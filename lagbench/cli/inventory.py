@@ -195,13 +195,12 @@ def info_command(
 
     description = textwrap.fill(entry.description, TEXT_WIDTH, break_on_hyphens=False)
     _print_title(name, entry)
-    print_line(f"{description}\n")
     for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
         for line in _describe_size(shown_size, size_overview):
             print_line(line)
     print_line("")
     print_table("Sizes", COLUMNS, map(_format_row, overviews))
-    print_line("")
+    print_line(f"\n{description}\n")
     rows = []
     for parameter_name, parameter in entry.parameters.items():
         values = []
@@ -238,11 +237,11 @@ def _describe_size(size: Size, size_overview: Overview) -> Iterator[str]:
         subsets.append(f"{name} {format_ids(ids)}")
     task = size.task
     yield f"{size_overview.split} {size_overview.size}"
-    yield f"  scenarios  {'; '.join(subsets)}"
     yield (
         f"  task       {task.input_frames} frames given, {task.horizon} to predict, "
         f"radius {task.radius}"
     )
+    yield f"  scenarios  {'; '.join(subsets)}"
     yield (
         f"  frame      {size.frame_interval:.6g} s, "
         f"{size.substeps_per_frame} substeps of {size.dt:.6g} s"

@@ -131,6 +131,8 @@ class ComparisonResult:
     is_against_reference: bool
     # the ranking one first; observables are left out
     metrics: Mapping[str, MetricComparison]
+    # of each method, over the classical side, by seed; "" in a scores.nc
+    speedups: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     def __repr__(self) -> str:
         """Return the two methods and the verdict; the values are too many."""
@@ -330,6 +332,10 @@ def compare(
         seeds=(len(one.seeds), len(two.seeds)),
         is_against_reference=is_reference,
         metrics=comparisons,
+        speedups=(
+            tuple(seed.speedup for seed in one.seeds),
+            () if is_reference else tuple(seed.speedup for seed in two.seeds),
+        ),
     )
 
 

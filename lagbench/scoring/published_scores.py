@@ -55,6 +55,18 @@ class _ScoreContent(_Content):
     undefined: list[Count]  # frames without a value by scenario
 
 
+class _SpeedupContent(_Content):
+    value: float
+    interval: tuple[float | None, float | None]
+    at_least: bool
+    classical_seconds: float
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        interval = "" if low is None else f" [{low:.3g}, {high:.3g}]"
+        return f"{'> ' if self.at_least else ''}{self.value:.3g}{interval}"
+
+
 class _ScoresContent(_Content):
     lagbench_scores: Literal[1]
     split: Name
@@ -67,6 +79,8 @@ class _ScoresContent(_Content):
     ranking_metric: Name
     task: _TaskContent
     rows: dict[str, dict[str, _ScoreContent]]  # by row and metric
+    speedup: _SpeedupContent | None = None
+    why_no_speedup: Text = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +94,8 @@ class PublishedScores:
     ranking: str  # name of the metric that ranks
     # scores by row and metric, over the horizon, without values per frame
     scores: Mapping[str, Mapping[str, Score]]
+    # over the classical side, or why there is none; "" where the file does not say
+    speedup: str = ""
 
 
 def read_scores(path: Path) -> PublishedScores:
@@ -132,6 +148,7 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
         predictions_sha256=checked.predictions_sha256,
         ranking=checked.ranking_metric,
         scores=rows,
+        speedup=str(checked.speedup or checked.why_no_speedup),
     )
 
 

@@ -260,6 +260,10 @@ def comparison_lines(result: ComparisonResult, *, every: bool = False) -> Iterat
         f"loss difference: {result.first} minus {result.second}; below 0 "
         f"{result.first} is better"
     )
+    names = (result.first, result.second)
+    for name, speedups in zip(names, result.speedups, strict=True):
+        if any(speedups):
+            yield f"speedup of {name}: {'; '.join(filter(None, speedups))}"
     shown = _shown_metrics(result, every=every)
     if any(any(comparison.undefined) for comparison in shown):
         yield "†: so many frames without a value"

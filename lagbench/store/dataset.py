@@ -17,7 +17,7 @@ from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import parse_viscosity, reading_error, select_parameters
-from lagbench.errors import DataError
+from lagbench.errors import DataError, UsageError
 
 from .copy import scenario_files, update_working_copy
 
@@ -69,18 +69,20 @@ def load_manifest(
 
 
 def open_split(
-    split: str | Path,
+    name: str | Path | None = None,
     size: str | None = None,
     *,
+    split: str | Path | None = None,
     subset: str = "test",
     root: str | Path | None = None,
 ) -> xr.Dataset:
     """Open one subset of a generated data set; arrays are read when computed.
 
     Args:
-        split: name of the split, or path of a local split's folder.
+        name: name of the split, or path of a local split's folder.
         size: name of the size; None takes the only one with data, or mini where several
             have data.
+        split: the same as ``name``.
         subset: train, valid or test; also shift or extra where the split has it.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
@@ -100,7 +102,18 @@ def open_split(
         UsageError: unknown split, size or subset.
         DataError: scenarios are missing, damaged, or of another version.
     """
-    tier, root_folder, _ = locate(split, size, root=root)
+    if name is not None and split is not None:
+        raise UsageError(
+            f"split={split!r} and {str(name)!r} both name the split; for train, valid "
+            "or test use subset="
+        )
+    name = split if name is None else name
+    if name is None or name in ("train", "valid", "test"):
+        raise UsageError(
+            f"{name!r} is no split; name one, as in "
+            'open_split("cavity", subset="train")'
+        )
+    tier, root_folder, _ = locate(name, size, root=root)
     paths = scenario_files(tier, root_folder, (subset,))
     hint = suggest_repair(tier, root=root_folder)
     # Files left open after an error would be closed by the garbage collector, in any

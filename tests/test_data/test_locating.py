@@ -117,6 +117,13 @@ def test_built_in_splits_are_located_in_the_root(tmp_path: Path) -> None:
     assert caught.value.where.endswith("/cavity")
 
 
+def test_a_subset_is_no_split() -> None:
+    with pytest.raises(UsageError, match="use subset="):
+        lagbench.open_split("cavity", split="train")
+    with pytest.raises(UsageError, match='subset="train"'):
+        lagbench.open_split(split="train")
+
+
 def folder_of_tests(root: Path, size: str) -> Path:
     """Return the folder of test scenarios of a cavity."""
     major = load().size("cavity", size).major

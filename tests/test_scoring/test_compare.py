@@ -323,6 +323,21 @@ def test_few_scenarios_decide_nothing(tmp_path: Path) -> None:
     assert side_of(a, c) == "same"
 
 
+def test_the_speedups_of_both_are_shown(tmp_path: Path) -> None:
+    """Or the reason why there is none."""
+    speedup = {
+        "value": 2.5,
+        "interval": [1.5, 4.0],
+        "at_least": True,
+        "classical_seconds": 0.1,
+    }
+    one = publish(tmp_path, ONES, method="one", speedup=speedup)
+    two = publish(tmp_path, TWOS, method="two", why_no_speedup="no cost")
+    result = compare(one, two)
+    assert result.speedups == (("> 2.5 [1.5, 4]",), ("no cost",))
+    assert "speedup of one: > 2.5 [1.5, 4]" in list(comparison_lines(result))
+
+
 def test_scores_nc_has_the_best_reference(scored: Folders) -> None:
     """It has the ranking metric of it, while scores.json has all metrics."""
     folder = scored["still"]
