@@ -84,8 +84,6 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
         )
     materials = set(options.materials)
     is_repeated = len(materials) < len(options.materials)
-    if info.wall_particles and (options.shape or options.density):
-        raise UsageError("model.shape and model.density know no particles of walls")
     numbers = range(len(PARTICLE_KINDS))
     if not materials or is_repeated or not materials <= set(numbers):
         raise UsageError(
