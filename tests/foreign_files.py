@@ -33,7 +33,7 @@ def solid(position: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def table_of(position: NDArray[np.floating]) -> pd.DataFrame:
-    """Return a table with a row for each particle and time, in the order of their ids."""
+    """Return a table with a row for each particle and time."""
     frames = []
     for number, frame in enumerate(position):
         columns = {
