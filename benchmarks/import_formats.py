@@ -22,9 +22,13 @@ from numpy.typing import NDArray
 CLONE = Path(__file__).parents[1]
 sys.path.insert(0, str(CLONE / "tests"))
 
-from foreign_files import CODE_BASES, FORMATS, INTERVAL  # noqa: E402
+from foreign_files import (  # type: ignore[import-not-found]  # noqa: E402
+    CODE_BASES,
+    FORMATS,
+    INTERVAL,
+)
 
-SHORT = 1_000
+SHORT = 4_000
 """Particles of the runs for valid and test."""
 
 

@@ -556,6 +556,7 @@ FRAMES: dict[str, Callable[[Path], Iterator[Frame]]] = {
     ".vtu": _vtk_frames,
     ".vtp": _vtk_frames,
     ".pvd": _pvd_frames,
+    ".vtkhdf": vtkhdf.read_frames,
     ".ply": _ply_frames,
     ".csv": _table_frames,
     ".parquet": _table_frames,
@@ -573,7 +574,6 @@ READERS: dict[str, Callable[[Path, Reading], list[Source]]] = {
     ".zarr": _read_netcdf,
     ".h5": _read_hdf5,
     ".hdf5": _read_hdf5,
-    ".vtkhdf": _read_hdf5,
     ".hdf": _read_hdf5,
     **dict.fromkeys(FRAMES, _read_frames),
 }

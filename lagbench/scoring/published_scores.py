@@ -57,7 +57,7 @@ class _ScoreContent(_Content):
 
 class _SpeedupContent(_Content):
     value: float
-    interval: tuple[float | None, float | None]
+    interval: Annotated[list[float | None], Field(min_length=2, max_length=2)]
     at_least: bool
     classical_seconds: float
 
