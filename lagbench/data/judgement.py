@@ -147,10 +147,11 @@ def judge_trajectory(
     low, high = np.array(sides).transpose(1, 0, 2)
     _refuse_blow_up(name, np.array(extents))
     motion.refuse_reordered_rows()
-    motion.refuse_uneven_frames()
+    pace_notes = motion.judge_pace()
     motion.refuse_jumps(box or unit_box(2))
     motion.refuse_velocities(frame_interval)
     notes = [
+        *pace_notes,
         *motion.describe_resolution(raw_position[~is_wall]),
         *motion.describe_rest(),
         *motion.describe_unmoved(position),
@@ -400,23 +401,36 @@ class _Motion:
                 "--axes particle,frame,space, or mend the file"
             )
 
-    def refuse_uneven_frames(self) -> None:
-        """Refuse frames that are missing, there twice, or out of order."""
+    def judge_pace(self) -> list[str]:
+        """Refuse frames that are missing, there twice, or out of order.
+
+        Where a steady motion goes on in another pace, which walls may do to a very
+        viscous fluid, there is a note.
+        """
+        notes = []
         last = len(self.steps) - 1
         for number in range(last + 1):
-            fault = self._find_change_of_pace(number)
-            if 0 < number < last:
-                fault = self._find_fault_between(number) or fault
-            if fault is not None:
-                sizes = [f"{_rms(step):.3g}" for step in self.steps]
-                raise DataError(
-                    f"{self.name}, frame {number + 1}: particles move {sizes[number]}, "
-                    f"and {', '.join(sizes[max(0, number - 2) : number]) or 'nothing'} "
-                    "in frames before and "
-                    f"{', '.join(sizes[number + 1 : number + 3]) or 'nothing'} after: "
-                    f"{fault}; give all frames once, at even times, or end the "
-                    "trajectory before this frame"
-                )
+            is_inside = 0 < number < last
+            fault = self._find_fault_between(number) if is_inside else None
+            change = self._find_change_of_pace(number)
+            if fault is None and change is None:
+                continue
+            sizes = [f"{_rms(step):.3g}" for step in self.steps]
+            text = (
+                f"{self.name}, frame {number + 1}: particles move {sizes[number]}, "
+                f"and {', '.join(sizes[max(0, number - 2) : number]) or 'nothing'} "
+                "in frames before and "
+                f"{', '.join(sizes[number + 1 : number + 3]) or 'nothing'} after: "
+                f"{fault or change}"
+            )
+            if fault is None and is_inside:
+                notes.append(f"{text}?")
+                continue
+            raise DataError(
+                f"{text}; give all frames once, at even times, or end the trajectory "
+                "before this frame"
+            )
+        return notes
 
     def _find_fault_between(self, number: int) -> str | None:
         """Return what is wrong with a step beside those before and after."""

@@ -406,10 +406,6 @@ REFUSED_MOTIONS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "frame missing": (lambda run: np.delete(run, 8, axis=0), "frame 8.*missing"),
     "second frame missing": (lambda run: np.delete(run, 1, axis=0), "frame 1.*missing"),
     "restarted": (lambda run: run[[*range(8), *range(6, 14)]], "out of order"),
-    "frames skipped from 8 on": (
-        lambda run: run[[*range(8), *range(9, 16, 2)]],
-        "frame 8.*uneven",
-    ),
 }
 
 
@@ -418,6 +414,15 @@ def test_a_wrong_motion_is_refused_at_its_frame(tmp_path: Path, name: str) -> No
     change, text = REFUSED_MOTIONS[name]
     with pytest.raises(DataError, match=text):
         adopt_datasets(tmp_path, lambda number: dataset_of(change(vortex(number))))
+
+
+def test_another_pace_is_noted(tmp_path: Path) -> None:
+    """Every second frame is given from frame 8 on."""
+    frames = [*range(8), *range(9, 24, 2)]
+    own = adopt_datasets(
+        tmp_path, lambda number: dataset_of(vortex(number, frames=24)[frames])
+    )
+    assert any("frame 8" in note and "uneven?" in note for note in own.notes)
 
 
 def test_a_body_that_flies_fast_is_no_exchange_of_axes(tmp_path: Path) -> None:
