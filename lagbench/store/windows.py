@@ -232,7 +232,8 @@ class Window(NamedTuple):
 
     # particle positions [length], shape [particle, frame, axis]
     position: NDArray[np.float32]
-    material: NDArray[np.int8]  # 0 liquid, 1 jelly, 2 snow, 3 rope, shape [particle]
+    # 0 liquid, 1 jelly, 2 snow, 3 rope, 4 wall, shape [particle]
+    material: NDArray[np.int8]
     # velocity of the walls [length/s], shape [frame, wall, axis]: the forcing on the
     # way to each frame, those to predict included; None in a split without moving walls
     wall_velocity: NDArray[np.float32] | None
