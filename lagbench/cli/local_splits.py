@@ -50,7 +50,7 @@ def import_command(
         axes: Axes of arrays without names, as in particle,frame,space; by default
             frame,particle,space.
         positions: Name of the positions; in HDF5 GROUP/NAME, where * is any name.
-        kinds: Material of each particle kind, as in 3=jelly,1=wall; 0=drop leaves 0 out.
+        kinds: Material of each particle kind, as in 3=jelly,1=wall,0=drop.
         radius: Connectivity radius of graph models; two spacings by default.
         frame_interval: Time between two frames [s], where the files do not state it.
         spacing: Distance of neighbouring particles at first; measured by default.

@@ -80,7 +80,7 @@ class _ScoresContent(_Content):
     task: _TaskContent
     rows: dict[str, dict[str, _ScoreContent]]  # by row and metric
     speedup: _SpeedupContent | None = None
-    why_no_speedup: Text = ""
+    why_no_speedup: Annotated[str, Field(max_length=200, pattern=r"^[ -~]*$")] = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

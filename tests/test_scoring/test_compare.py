@@ -19,6 +19,7 @@ from lagbench.scoring.compare import compare
 from lagbench.scoring.front import digits
 from lagbench.scoring.tables import (
     card_tables,
+    comparison_lines,
     comparison_tables,
 )
 
