@@ -151,7 +151,7 @@ def load_scored_task(
                 )
             file.check_material()
             numbers = np.unique(file.read("material")).tolist()
-        present.update(MATERIALS[number] for number in numbers)
+        present.update(MATERIALS[number] for number in numbers if number != WALL)
 
     statistics: Mapping[str, tuple[float, ...]] = {}
     limit: tuple[float, ...] = ()
