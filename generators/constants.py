@@ -21,7 +21,6 @@ from lagbench.errors import (
     WorkFailedError,
     describe_exception,
     find_place_in_extension,
-    text_of,
 )
 
 from .draws import RandomSource, uniform
@@ -175,7 +174,7 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
         if place is not None:
             raise WorkFailedError(
                 f"{work} failed in the module of split {size.split!r}: got "
-                f"{type(error).__name__}: {text_of(error)}, expected no exception; "
+                f"{type(error).__name__}: {error}, expected no exception; "
                 "mend this line of the module, or the parameters that it uses: "
                 f"{place_of(size)}",
                 where=place,

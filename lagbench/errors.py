@@ -72,40 +72,17 @@ class LagbenchError(Exception):
 
     exit_code: ClassVar[int] = 1
 
-    # expected and fix are the form of older calls, which show them in lines
     def __init__(
-        self,
-        text: str,
-        *,
-        where: str | None = None,
-        got: object = None,
-        expected: object = None,
-        fix: str | None = None,
+        self, text: str, *, where: str | None = None, got: object = None
     ) -> None:
         super().__init__(text)
         self.text = text
         self.where = where
         self.got = got
-        self._is_old = expected is not None or fix is not None
-        self.expected = expected
-        self.what = text
-        self.fix = fix
-        if not self._is_old and "; " in text:
-            self.what, _, self.fix = text.partition("; ")
 
     def __str__(self) -> str:
         """Return the message."""
-        if self._is_old:
-            return compose_message(
-                self.text,
-                where=self.where,
-                expected=self.expected,
-                got=self.got,
-                fix=self.fix,
-            )
-        if self.where is None:
-            return self.text
-        return f"{self.where}: {self.text}"
+        return self.text if self.where is None else f"{self.where}: {self.text}"
 
     def add_note(self, note: str, /) -> None:
         """Add a place to ``where``; our messages do not show Python's own notes."""
@@ -149,22 +126,6 @@ def escape_line(text: str) -> str:
     return escape_unprintable(text).replace("\n", "\\n")
 
 
-def compose_message(
-    what: str, *, where: str | None, expected: object, got: object, fix: str | None
-) -> str:
-    """Return the parts of a message in lines; those that are None are left out."""
-    lines = [what]
-    if where is not None:
-        lines.append(f"where: {escape_line(where)}")
-    for label, value in (("expected", expected), ("got", got)):
-        if value is not None:
-            indented = str(value).replace("\n", "\n    ")
-            lines.append(f"{label}: {indented}")
-    if fix is not None:
-        lines.append(f"fix: {fix}")
-    return escape_unprintable("\n  ".join(lines))
-
-
 class ChecksFailedError(LagbenchError):
     """A check did not hold."""
 
@@ -177,54 +138,12 @@ class UsageError(LagbenchError):
     exit_code = 2
 
 
-class UnknownKeyError(UsageError, KeyError):
-    """A mapping has no entry of that name.
-
-    It is a KeyError as well, as Python raises for such a name.
-    """
-
-
 class NotInstalledError(UsageError, ModuleNotFoundError):
     """An optional package is not installed.
 
     It is a ModuleNotFoundError as well, as Python raises for such an import. So
     ``except ImportError`` around an import catches it.
     """
-
-
-class UsageErrorCollector:
-    """Collect the usage errors of several ``with`` blocks, to raise them together."""
-
-    def __init__(self) -> None:
-        self._errors: list[UsageError] = []
-
-    def __enter__(self) -> None:
-        """Begin a block that may raise a usage error."""
-
-    def __exit__(
-        self, kind: object, error: BaseException | None, trace: object
-    ) -> bool:
-        """Keep a usage error and go on after the block; anything else is raised."""
-        if not isinstance(error, UsageError):
-            return False
-        self._errors.append(error)
-        return True
-
-    def raise_errors(self) -> None:
-        """Raise the collected errors, if there are any.
-
-        Raises:
-            UsageError: the one error, or all of them numbered.
-        """
-        if not self._errors:
-            return
-        if len(self._errors) == 1:
-            raise self._errors[0]
-        lines = [f"{len(self._errors)} mistakes"]
-        for number, error in enumerate(self._errors, start=1):
-            indented = str(error).replace("\n", "\n   ")
-            lines.append(f"\n  {number}. {indented}")
-        raise UsageError("".join(lines))
 
 
 class UnreadableFileError(LagbenchError):
@@ -368,11 +287,6 @@ def find_place_in_extension(error: BaseException, *modules: str) -> str | None:
         if module_name.split(".")[0] in packages:
             place = f"{frame.f_code.co_filename}, line {line}"
     return place
-
-
-def text_of(error: BaseException) -> str:
-    """Return the text of an exception."""
-    return str(error)
 
 
 def describe_exception(error: BaseException, *modules: str) -> str:

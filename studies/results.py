@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lagbench.figures.tables import markdown
+from lagbench.figures.tables import escape
 
 Json = Any
 MODEL_KINDS = ("learned", "hybrid")
@@ -144,7 +144,11 @@ def summary_table(rows: Sequence[Json]) -> str:
             )
         )
     heads = ("data set", "metric", "best naive", "best classical side", "best network")
-    return markdown((*heads, "kind", "speedup"), lines)
+    head, *others = [
+        f"| {' | '.join(map(escape, cells))} |"
+        for cells in ((*heads, "kind", "speedup"), *lines)
+    ]
+    return "\n".join([head, "| " + " | ".join(7 * ["---"]) + " |", *others])
 
 
 def render(board: Json, page: Path) -> dict[Path, str]:

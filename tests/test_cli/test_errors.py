@@ -33,7 +33,6 @@ def test_an_error_crosses_process_borders(
 def test_python_catches_our_errors_by_its_own_classes() -> None:
     with pytest.raises(ImportError):
         errors.require("no_such_package_at_all", extra="plots")
-    assert issubclass(errors.UnknownKeyError, KeyError)
     assert issubclass(NotInstalledError, UsageError)
 
 
