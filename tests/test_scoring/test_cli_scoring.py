@@ -139,14 +139,6 @@ def test_several_files_keep_their_scores(
     assert [path.name for path in report.iterdir()] == ["index.html"]
 
 
-@pytest.mark.slow
-def test_namesakes_are_numbered(run: Run, two_submissions: list[Path]) -> None:
-    result = run("compare", *two_submissions)
-    assert result.exit_code == 0, result.stderr
-    for number, path in enumerate(two_submissions, start=1):
-        assert f"({number}): {path}" in result.stdout
-
-
 def test_two_files_never_share_a_folder_of_scores(
     run: Run, two_submissions: list[Path], tmp_path: Path
 ) -> None:

@@ -191,25 +191,19 @@ def test_errors_below_the_perturbed_run_raise_the_flag() -> None:
     assert flag.evidence == {"frames_below": 1.0, "frames_compared": 3.0}
 
 
-def test_errors_above_the_perturbed_run_do_not_raise_the_flag() -> None:
-    error = np.array([5e-5, 1e-3, 1e-2, 0.4])
-    flag = judge_predictability(error, PERSISTENCE_ERROR, PERTURBED_ERROR)
-    assert flag.raised is False
-
-
-@pytest.mark.parametrize("limit", [(), PERTURBED_ERROR[:3]])
-def test_without_a_perturbed_run_the_flag_is_undecided(limit: Sequence[float]) -> None:
-    """So it is with one of other frames."""
-    flag = judge_predictability(PERSISTENCE_ERROR, PERSISTENCE_ERROR, limit)
-    assert flag.raised is None
-    assert flag.reasons
-
-
-def test_a_perturbed_run_that_has_lost_the_truth_decides_nothing() -> None:
-    flag = judge_predictability(PERSISTENCE_ERROR, PERSISTENCE_ERROR, PERSISTENCE_ERROR)
-    assert flag.raised is None
-    assert flag.reasons
-    assert flag.evidence == {"frames_below": 0.0, "frames_compared": 0.0}
+@pytest.mark.parametrize(
+    ("error", "limit", "is_raised"),
+    [
+        (np.array([5e-5, 1e-3, 1e-2, 0.4]), PERTURBED_ERROR, False),
+        (PERSISTENCE_ERROR, (), None),
+        (PERSISTENCE_ERROR, PERTURBED_ERROR[:3], None),  # of other frames
+        (PERSISTENCE_ERROR, PERSISTENCE_ERROR, None),  # it has lost the truth
+    ],
+)
+def test_other_errors_do_not_raise_it(
+    error: Floats, limit: Sequence[float], is_raised: bool | None
+) -> None:
+    assert judge_predictability(error, PERSISTENCE_ERROR, limit).raised is is_raised
 
 
 @pytest.mark.parametrize(

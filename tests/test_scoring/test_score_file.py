@@ -204,17 +204,6 @@ def test_json_values_have_nine_digits(value: float, expected: float | None) -> N
     assert digits(value) == expected
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[1, 2]", b"null"])
-def test_a_file_without_a_json_object_is_unreadable(
-    tmp_path: Path, content: bytes
-) -> None:
-    path = tmp_path / "scores.json"
-    path.write_bytes(content)
-    with pytest.raises(UnreadableFileError) as caught:
-        read_scores(path)
-    assert caught.value.where == str(path)
-
-
 @pytest.mark.parametrize("length", [0, 100, 5000, 20000])
 def test_truncated_netcdf_is_unreadable(
     card: ScoreCard, tmp_path: Path, length: int
@@ -224,10 +213,3 @@ def test_truncated_netcdf_is_unreadable(
     path.write_bytes(content[:length])
     with pytest.raises(UnreadableFileError):
         read_statistics(path)
-
-
-def test_predictions_are_no_scores_file(card: ScoreCard) -> None:
-    predictions = card.files[1].parent / "predictions.nc"
-    with pytest.raises(UnreadableFileError) as caught:
-        read_statistics(predictions)
-    assert caught.value.where == str(predictions)
