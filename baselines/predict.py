@@ -23,6 +23,7 @@ from lagbench.data.layout import expand_home
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.store.copy import scenario_files
 from lagbench.submission.writer import PredictionsWriter, check_predictions_output
 from lagbench.work.run import Meter, Progress
 
@@ -33,7 +34,7 @@ from .checkpoint import Checkpoint, check_data, load, restore
 from .dataset_info import find_forcing
 from .machine import choose_device, hardware, use_threads
 from .recipe import change_options
-from .rollout import count_predicted, roll_out, scenario_batch, scenario_paths
+from .rollout import count_predicted, roll_out, scenario_batch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,13 +149,7 @@ def predict(
     )
     tier = known_splits.size(info.split, info.size)
     tier.scored_on(subset)
-    files = scenario_paths(
-        info.split,
-        subset=subset,
-        size=info.size,
-        root=root_folder,
-        registry=known_splits,
-    )
+    files = scenario_files(tier, root_folder, (subset,))
     machine = choose_device(device)
     with use_threads(threads):
         model = restore_for_size(

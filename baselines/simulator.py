@@ -449,7 +449,7 @@ class GraphNetwork(Baseline):
                 self, batch, generator, noise_spread=self.options.noise_spread
             )
             if self.options.noise_std > 0.0:
-                position = self._keep_inside(batch.position)
+                position = self.box.inside(batch.position)
                 batch = replace(batch, position=position)
         given = batch.part(slice(self.history))
         state = self.start(given)
@@ -599,10 +599,12 @@ class GraphNetwork(Baseline):
             velocity = last_velocity + acceleration
 
         position = state.position + velocity
-        inside = self._keep_inside(position)
+        constant = position.detach()
+        inside = self.box.inside(constant)
         if state.obstacle is not None:
-            own_obstacle = state.obstacle[state.sample]
-            inside = self._keep_outside(inside, own_obstacle)
+            inside = self.box.outside(inside, state.obstacle[state.sample])
+        # with the gradient of the position: a clamp would have none at a wall
+        inside = inside + (position - constant)
         correction = self.box.displacement(position, inside)
         velocity = velocity + correction.detach()
         inside, velocity = self._hold_walls(state, inside, velocity)
@@ -666,29 +668,6 @@ class GraphNetwork(Baseline):
             state.position, state.sample, force, state.obstacle
         )
         return features
-
-    def _keep_inside(self, position: Tensor) -> Tensor:
-        """Return positions in the box, with the gradient of those given.
-
-        A clamp would have no gradient at a wall.
-        """
-        constant = position.detach()
-        clamped = self.box.inside(constant)
-        zero = position - constant
-        return clamped + zero
-
-    def _keep_outside(self, position: Tensor, obstacle: Tensor) -> Tensor:
-        """Return positions outside the obstacle, with the gradient of those given.
-
-        Args:
-            position: positions [length], shape [particle, axis].
-            obstacle: centre and radius of each particle's obstacle [length], shape
-                [particle, axis + 1].
-        """
-        constant = position.detach()
-        outside = self.box.outside(constant, obstacle)
-        zero = position - constant
-        return outside + zero
 
 
 _CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}

@@ -41,6 +41,7 @@ from lagbench.data.layout import expand_home
 from lagbench.data.local import check_contents, locate
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
+from lagbench.store.copy import scenario_files
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, Track, track_of
 from lagbench.tensors import Batch, collate
 from lagbench.torch import WindowDataset, WindowSampler
@@ -55,7 +56,7 @@ from .machine import choose_device, hardware, is_helper, use_threads
 from .optimisation import Optimisation
 from .randomness import derive_seed, preserve_generators, seed_generators
 from .recipe import Recipe, TrainingOptions, recipe_for
-from .rollout import Validation, load_validation, scenario_batch, scenario_paths
+from .rollout import Validation, load_validation, scenario_batch
 from .start import start_from
 from .training_log import OVER, STOPPED_EARLY, TrainingLog
 
@@ -501,13 +502,7 @@ class _Training:
         size = self.registry.size(self.info.split, self.info.size)
         paths: list[Path] = []
         for subset in self.plan.training.windows:
-            files = scenario_paths(
-                self.info.split,
-                subset=subset,
-                size=self.info.size,
-                root=self.root,
-                registry=self.registry,
-            )
+            files = scenario_files(size, self.root, (subset,))
             check_contents(size, self.root, files)
             paths += files.values()
 

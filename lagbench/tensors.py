@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -271,43 +271,15 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
         UsageError: the windows differ in length, in whether walls move or a force
             drives the flow, or in whether their viscosity is known.
     """
-    wall_velocities = []
-    body_forces = []
-    origins = []
-    viscosities = []
-    obstacles = []
-    masses = []
-    frictions = []
-    lengths = set()
-    for window in windows:
-        lengths.add(window.position.shape[1])
-        if window.wall_velocity is not None:
-            wall_velocities.append(window.wall_velocity)
-        if window.body_force is not None:
-            body_forces.append(window.body_force)
-        if window.origin is not None:
-            origins.append(window.origin)
-        if window.viscosity is not None:
-            viscosities.append(window.viscosity)
-        if window.obstacle is not None:
-            obstacles.append(window.obstacle)
-        if window.particle_mass is not None:
-            masses.append(window.particle_mass)
-        if window.friction is not None:
-            frictions.append(window.friction)
-
-    all_or_none = {0, len(windows)}
-    given = (
-        wall_velocities,
-        body_forces,
-        origins,
-        viscosities,
-        obstacles,
-        masses,
-        frictions,
-    )
-    is_uniform = {len(values) for values in given} <= all_or_none
-    if len(lengths) != 1 or not is_uniform:
+    lengths = {window.position.shape[1] for window in windows}
+    is_uniform = len(lengths) == 1
+    optional: dict[str, Tensor | None] = {}
+    for name, join in JOINS.items():
+        values = [getattr(window, name) for window in windows]
+        known = [value for value in values if value is not None]
+        is_uniform &= len(known) in (0, len(values))
+        optional[name] = join(known) if known else None
+    if not is_uniform:
         raise UsageError(
             "windows do not fit side by side: their lengths or variables differ; "
             "collate windows of one WindowDataset",
@@ -319,31 +291,32 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
         position=torch.cat([window.position for window in windows]),
         sample=torch.arange(len(windows)).repeat_interleave(particle_counts),
         material=torch.cat([window.material for window in windows]),
-        wall_velocity=_stack_forcing(wall_velocities),
         scenario=torch.tensor([window.scenario for window in windows]),
         frame=torch.tensor([window.frame for window in windows]),
-        origin=torch.cat(origins) if origins else None,
-        viscosity=torch.tensor(viscosities) if viscosities else None,
-        body_force=_stack_forcing(body_forces),
-        obstacle=torch.stack(obstacles) if obstacles else None,
-        particle_mass=_in_double(masses),
-        friction=_in_double(frictions),
+        **optional,
     )
 
 
-def _in_double(values: Sequence[float]) -> Tensor | None:
-    """Return a number for each window in float64; None without any."""
-    if not values:
-        return None
+def _in_double(values: Sequence[float]) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def _stack_forcing(forcings: Sequence[Tensor]) -> Tensor | None:
+def _stack_forcing(forcings: Sequence[Tensor]) -> Tensor:
     """Return the forcing of all windows as far as that of each is known.
 
-    The shape is [window, frame, wall or layer, axis]; None where nothing drives them.
+    The shape is [window, frame, wall or layer, axis].
     """
-    if not forcings:
-        return None
     shared_length = min(len(forcing) for forcing in forcings)
     return torch.stack([forcing[:shared_length] for forcing in forcings])
+
+
+JOINS: Mapping[str, Callable[[Any], Tensor]] = {
+    "wall_velocity": _stack_forcing,
+    "origin": torch.cat,
+    "viscosity": torch.tensor,
+    "body_force": _stack_forcing,
+    "obstacle": torch.stack,
+    "particle_mass": _in_double,
+    "friction": _in_double,
+}
+"""How what windows may hold is put side by side."""

@@ -60,28 +60,17 @@ Window = TensorWindow
 
 def tensors(window: ArrayWindow) -> Window:
     """Return a window's arrays as tensors; float32 arrays are shared, not copied."""
-    wall_velocity = None
-    if window.wall_velocity is not None:
-        wall_velocity = torch.from_numpy(window.wall_velocity)
-    body_force = None
-    if window.body_force is not None:
-        body_force = torch.from_numpy(window.body_force)
-    obstacle = None
-    if window.obstacle is not None:
-        obstacle = torch.from_numpy(window.obstacle)
-    origin = None
-    if window.origin is not None:
-        origin = torch.from_numpy(window.origin)
+    optional: dict[str, Any] = {}
+    for name in ("wall_velocity", "origin", "body_force", "obstacle"):
+        array = getattr(window, name)
+        optional[name] = None if array is None else torch.from_numpy(array)
     return TensorWindow(
         position=torch.from_numpy(window.position),
         material=torch.from_numpy(window.material).long(),
-        wall_velocity=wall_velocity,
         scenario=window.scenario,
         frame=window.frame,
-        origin=origin,
         viscosity=window.viscosity,
-        body_force=body_force,
-        obstacle=obstacle,
+        **optional,
     )
 
 
@@ -344,25 +333,20 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
 
 def _check_step_result(position: object, last_position: Tensor) -> None:
     """Refuse a result that is no real tensor of the kind of the last positions."""
-    shape = last_position.shape
-    device = last_position.device
-    expected = f"a tensor of shape {list(shape)}: [particle, axis]"
-    fix = "return the positions of the next frame only: position[:, -1] + v"
+    if (
+        isinstance(position, Tensor)
+        and position.shape == last_position.shape
+        and position.device == last_position.device
+        and not position.is_complex()
+    ):
+        return
     got = type(position).__name__
-    if isinstance(position, np.ndarray):
-        got = f"a NumPy array of shape {list(position.shape)}"
-        fix = "return a tensor: torch.from_numpy(array).to(batch.position)"
-    elif isinstance(position, Tensor):
-        got = f"a tensor of shape {list(position.shape)}"
-        if position.shape == shape:
-            if position.device == device and not position.is_complex():
-                return
-            expected = f"real numbers on the device {device}"
-            got = f"{position.dtype} on {position.device}"
-            fix = "return real numbers where the batch lies: .to(batch.position)"
+    if isinstance(position, (Tensor, np.ndarray)):
+        got = f"{got} of {position.dtype}, shape {list(position.shape)}"
     raise UsageError(
-        f"a model returned no positions of the next frame: got {got}, expected "
-        f"{expected}; {fix}",
+        f"a model returned no positions of the next frame: {got}; return a tensor of "
+        f"real numbers, [particle, axis] = {list(last_position.shape)}, on the device "
+        f"{last_position.device}",
         where="roll_out, step",
     )
 
