@@ -6,6 +6,7 @@ the means over its seeds and the tasks of one family.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -111,28 +112,37 @@ def _make_row(
 
 
 def conclude_design(rows: Sequence[DesignRow]) -> list[str]:
-    """Return sentences: where a surrogate finds better parameters in the same time."""
-    coarse = {}
-    for row in rows:
-        if row.method == COARSE:
-            coarse[row.family, row.budget] = row
+    """Return sentences: where a surrogate finds better parameters in the same time.
+
+    Networks are compared with CMA-ES on the coarse simulator, which is compared with
+    CMA-ES on the judge's.
+    """
+    by_place = {(row.family, row.budget, row.method): row for row in rows}
     sentences = []
     better = 0
+    compared = 0
     for row in rows:
-        other = coarse.get((row.family, row.budget))
-        if SURROGATE not in row.method or other is None:
+        is_network = SURROGATE in row.method
+        if not is_network and row.method != COARSE:
+            continue
+        reference = COARSE if is_network else "cma"
+        other = by_place.get((row.family, row.budget, reference))
+        if other is None:
             continue
         mean, low, high, count = row.difference(other)
-        better += low > 0.0
-        sentences.append(
-            f"{row.family}, {row.budget} runs' worth of time: {row.method} scores "
-            f"{mean:+.2f} against {COARSE} (95 % interval {low:+.2f} to {high:+.2f}, "
-            f"{count} tasks)."
+        if is_network:
+            compared += 1
+            better += low > 0.0
+        if not math.isnan(low):
+            sentences.append(
+                f"{row.family}, {row.budget} runs' worth of time: {row.method} scores "
+                f"{mean:+.2f} against {reference} (95 % interval {low:+.2f} to "
+                f"{high:+.2f}, {count} tasks)."
+            )
+    head = "No trained surrogate has been searched with yet."
+    if compared:
+        head = (
+            "A surrogate finds better parameters than CMA-ES on the coarse simulator "
+            f"in the same time in {better} of {compared} comparisons."
         )
-    if not sentences:
-        return ["No trained surrogate has been searched with yet."]
-    head = (
-        "A surrogate finds better parameters than CMA-ES on the coarse simulator in "
-        f"the same time in {better} of {len(sentences)} comparisons."
-    )
     return [head, *sentences]
