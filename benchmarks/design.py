@@ -6,11 +6,12 @@
 Both take ``--families pour,stir``, ``--instances 4`` (the first of each family) and
 ``--rows`` (another folder than leaderboard/design).
 
-``known`` writes the best of 64 random draws and the best of a CMA-ES search to
-lagbench/design/known.json; better parameters in leaderboard/design take their place.
-``search`` searches once with a budget of 100 simulator runs' worth of processor time,
-and writes what it had found after 1, 10 and 100 of them, judged, to
-leaderboard/design/METHOD-BUDGET-SEED.json. Both can be interrupted and go on.
+``known`` writes the best of 64 random draws and the best of a CMA-ES search (of
+``stir`` the best of four constant programs) to lagbench/design/known.json; better
+parameters in leaderboard/design take their place. ``search`` searches once with a
+budget of 100 simulator runs' worth of processor time, and writes what it had found
+after 1, 10 and 100 of them, judged, to leaderboard/design/METHOD-BUDGET-SEED.json. Both
+can be interrupted and go on.
 
 METHOD is random, cma (CMA-ES on the simulator), cma-coarse (CMA-ES on the restarted
 simulator with half as many cells along each axis), cma-neuralmpm (CMA-ES on a trained
@@ -81,6 +82,8 @@ def find_known(runs: int, names: Sequence[str], rows: Path) -> None:
             best = drawn
             if task.truth is not None:
                 best = list(task.truth)
+            elif task.marked_axis is not None:
+                best = min(constant_programs(task), key=task.objective)
             elif runs:
                 best = cma_search(task, task.objective, runs=runs, seed=RANDOM_SEED)
             known[name] = Known(
@@ -100,6 +103,16 @@ def find_known(runs: int, names: Sequence[str], rows: Path) -> None:
                 )
         write_known(known)
         print(name, known[name].random, known[name].best, flush=True)
+
+
+def constant_programs(task: DesignTask) -> list[list[float]]:
+    """Return programs of both walls of ``stir`` at full speed, either way."""
+    knots = len(task.parameters) // 2
+    programs = []
+    for first in (0.0, 1.0):
+        for second in (0.0, 1.0):
+            programs.append(task.at(knots * [first] + knots * [second]))
+    return programs
 
 
 def write_known(known: dict[str, Known]) -> None:
