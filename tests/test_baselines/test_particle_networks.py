@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import Symmetry, mirror_batch, mirror_matrices
-from lagbench.baselines.baseline import Batch, DatasetInfo
+from lagbench.baselines.baseline import DatasetInfo
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.predict import predict
@@ -27,6 +27,7 @@ from lagbench.board.verified import Level
 from lagbench.data.registry import Registry
 from lagbench.make.generate import GenerationResult
 from lagbench.models.registered import export_safetensors
+from lagbench.tensors import Batch
 from lagbench.work.run import Progress
 
 EQUIVARIANT = ["egnn", "painn", "segnn"]
