@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from lagbench.data.box import Box, parse_periodic
 from lagbench.errors import UsageError
-from lagbench.tensors import Batch, TensorBox
+from lagbench.tensors import Batch as Batch
+from lagbench.tensors import TensorBox
 
 
 class Settings(BaseModel):

@@ -71,22 +71,22 @@ class ParticleGrid(nn.Module):
         self.spacing = widest_side / cells
 
         cell_widths = []
-        for axis, (low, high) in enumerate(bounds):
+        for axis, (start, end) in enumerate(bounds):
             width = self.spacing
             if box.periodic[axis]:
                 # The multiple of nodes that is nearest to the number of spacings in the
                 # period, but at least three: a particle touches three different nodes.
-                nearest_multiples = round((high - low) / self.spacing / multiple)
+                nearest_multiples = round((end - start) / self.spacing / multiple)
                 fewest_multiples = math.ceil(3 / multiple)
                 nodes = multiple * max(nearest_multiples, fewest_multiples)
-                width = (high - low) / nodes
+                width = (end - start) / nodes
                 numbers = torch.arange(nodes, dtype=torch.float64)
-                places = low + (numbers + 0.5) * width
+                places = start + (numbers + 0.5) * width
             else:
-                nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
+                nodes = math.ceil((end - start) / self.spacing - 1e-6) + 2
                 nodes += -nodes % multiple
                 numbers = torch.arange(nodes, dtype=torch.float64)
-                middle = (low + high) / 2
+                middle = (start + end) / 2
                 places = middle + (numbers - (nodes - 1) / 2) * self.spacing
             cell_widths.append(width)
             self.register_buffer(f"axis_{AXES[axis]}", places.float(), persistent=False)
