@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lagbench.data.layout import has_file
 from lagbench.data.local import check_contents
 from lagbench.data.registry import Registry, Size, load
+from lagbench.errors import UsageError, suggest_name
 from lagbench.metrics.aggregate import Tally, aggregate
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import METRICS, select
@@ -88,6 +89,9 @@ def sizes_with_test_files(
     if split and name:
         return [registry.size(split, name)]
     sizes = []
+    known = {size for one in registry.splits.values() for size in one.sizes}
+    if name is not None and name not in known:
+        raise UsageError(f"no size {name!r}; {suggest_name(name, known)}")
     for one_split in [split] if split else registry.splits:
         for one_name in registry.split(one_split).sizes:
             size = registry.size(one_split, one_name)
