@@ -21,6 +21,7 @@ NeuralMPM) or gradient-neuralmpm (Adam through it); the last two for one family.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import sys
 import time
@@ -201,12 +202,13 @@ def method_of(
         message = f"{method} needs --weights"
         raise SystemExit(message)
     # without torch for the others
-    from benchmarks.design_neuralmpm import Surrogate, descend
-
-    surrogate = Surrogate(weights, task)
+    neuralmpm = importlib.import_module("benchmarks.design_neuralmpm")
+    surrogate = neuralmpm.Surrogate(weights, task)
     if method == "cma-neuralmpm":
         return cma_search, surrogate.objective
-    return partial(descend, surrogate=surrogate), surrogate.objective_and_gradient
+    return partial(
+        neuralmpm.descend, surrogate=surrogate
+    ), surrogate.objective_and_gradient
 
 
 def time_of(task: DesignTask, objective: Objective) -> float:

@@ -52,9 +52,10 @@ class FullBox(Driver[FullBoxParameters]):
         rounded_number = diffusion_number.astype(np.float32)
         kernels.diffusion_number.from_numpy(rounded_number)
         if p.obstacle_particles:
-            kernels.place_obstacles([state.obstacle for state in states])
+            obstacles = [one.obstacle for one in states if one.obstacle is not None]
+            kernels.place_obstacles(obstacles)
         if p.fringe_rate:
-            streams = np.stack([state.stream for state in states])
+            streams = np.stack([one.stream for one in states if one.stream is not None])
             kernels.set_stream(streams.astype(np.float32))
         for field in (
             kernels.drag,

@@ -31,7 +31,7 @@ class Obstacle:
 
 
 def is_inside(
-    points: Array, centre: Sequence[float], radius: float
+    points: Array, centre: Sequence[float] | Array, radius: float
 ) -> NDArray[np.bool_]:
     """Tell which points lie less than a radius away from a centre.
 

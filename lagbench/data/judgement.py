@@ -120,7 +120,8 @@ def judge_trajectory(
     sides = []
     extents = []
     before = None
-    walls = None
+    fixed = np.zeros(0, bool) if is_wall is None else is_wall
+    walls: Floats = np.zeros((0, 0))
     for number, (raw_position, velocity) in enumerate(frames):
         position = raw_position.astype(np.float64)
         where = f"{name}, frame {number}"
@@ -131,13 +132,13 @@ def judge_trajectory(
         if number == 0:
             _refuse_lone_particle(position, where)
             if is_wall is None:
-                is_wall = np.zeros(len(position), bool)
-            motion = _Motion(name, np.flatnonzero(~is_wall))
-            walls = position[is_wall]
+                fixed = np.zeros(len(position), bool)
+            motion = _Motion(name, np.flatnonzero(~fixed))
+            walls = position[fixed]
         sides.append((position.min(axis=0), position.max(axis=0)))
-        _refuse_moving_walls(position, walls, is_wall, where)
-        position = position[~is_wall]
-        velocity = None if velocity is None else velocity[~is_wall]
+        _refuse_moving_walls(position, walls, fixed, where)
+        position = position[~fixed]
+        velocity = None if velocity is None else velocity[~fixed]
         extents.append(np.ptp(position, axis=0).max())
         moments.append(_moments(position))
         step = 0.0 * position if before is None else box.displacement(before, position)
@@ -152,7 +153,7 @@ def judge_trajectory(
     motion.refuse_velocities(frame_interval)
     notes = [
         *pace_notes,
-        *motion.describe_resolution(raw_position[~is_wall]),
+        *motion.describe_resolution(raw_position[~fixed]),
         *motion.describe_rest(),
         *motion.describe_unmoved(position),
     ]

@@ -441,7 +441,7 @@ def _complete(
             f"{len(with_velocity)} of {len(members)} trajectories; those of others are "
             "differences of positions"
         )
-    shortest = min(judged["valid"] + judged["test"], key=lambda one: one.frames)
+    shortest = min([*judged["valid"], *judged["test"]], key=lambda one: one.frames)
     if description.horizon is None and shortest.frames < max(m.frames for m in members):
         notes.append(
             f"{shortest.judgement.name} has {shortest.frames} frames, others more: "
