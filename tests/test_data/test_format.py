@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenario
 
-from lagbench.data import MATERIALS
+from lagbench.data import MATERIALS, PARTICLE_KINDS
 from lagbench.data.checksums import ContentHasher, file_sha256
 from lagbench.data.scenario import check_scenario, read_scenario, rehash
 from lagbench.data.writer import ScenarioWriter
@@ -269,7 +269,7 @@ def open_writer(path: Path, **changes: Any) -> ScenarioWriter:
     return ScenarioWriter(path, KEY, **(options | changes))
 
 
-@pytest.mark.parametrize("number", [len(MATERIALS), -1])
+@pytest.mark.parametrize("number", [len(PARTICLE_KINDS), -1])
 def test_an_unknown_material_is_found_though_the_hashes_fit(
     written: Written, number: int
 ) -> None:

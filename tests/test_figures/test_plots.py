@@ -156,7 +156,7 @@ def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
     for colour in MATERIAL_COLOURS:
         pixels = has_colour(image, colour)
         is_shown.append(bool(pixels.any()))
-    assert is_shown == [True, True, True, False]
+    assert is_shown == [True, True, True, False, False]
 
 
 def test_frames_at_rest_have_no_say_in_a_common_colour_scale() -> None:

@@ -11,9 +11,22 @@ import pytest
 from lagbench.data.registry import load
 from lagbench.work.engine import ENGINE_VARIABLE, ENGINES
 
+QUICK = ("curl-noise", "fluid", "curl-noise-3d")
+"""Splits of each formulation that compile in seconds under both engines."""
+
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("split", load().splits)
+@pytest.mark.parametrize(
+    "split",
+    [
+        *QUICK,
+        *[
+            pytest.param(split, marks=pytest.mark.slow)
+            for split in load().splits
+            if split not in QUICK
+        ],
+    ],
+)
 def test_every_engine_makes_the_bits_of_tiny(
     split: str, engine: str, tmp_path: Path
 ) -> None:

@@ -13,7 +13,6 @@ import pytest
 from html_check import Reading, read_html
 from score_bench import ScoreBench, half_right
 
-import lagbench
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.task import SUBMISSION
 
@@ -58,18 +57,3 @@ def test_a_card_shows_hostile_names_as_text(card: ScoreCard) -> None:
     reading = assert_plain_table(hostile._repr_html_())
     (table,) = reading.named("table")
     assert table.text.count(TEXT) == 7
-
-
-def test_windows_show_hostile_names_as_text(bench: ScoreBench) -> None:
-    windows = lagbench.windows(
-        bench.size.split,
-        bench.size.name,
-        subset="test",
-        root=bench.root,
-        registry=bench.registry,
-    )
-    windows.subsets = (TEXT,)
-    windows.size = windows.size.model_copy(update={"split": TEXT})
-    reading = assert_plain_table(windows._repr_html_())
-    (table,) = reading.named("table")
-    assert table.text.count(TEXT) == 2

@@ -108,8 +108,10 @@ def _horizon_table(subject: Subject, title: str, names: Sequence[str]) -> Report
         for score in scores:
             values.append(np.array([]) if score is None else score.values)
         best = _find_best(metric, values)
-        aim = AIMS.get(metric.direction, f"aims at {metric.perfect:g}")
-        note = f"{metric.summary}; {aim}"
+        if metric.direction in AIMS:
+            note = f"{metric.summary}; {AIMS[metric.direction]}"
+        else:
+            note = f"{metric.summary}; aims at {metric.perfect:g}"
         cells = [ReportCell(f"{metric.name}{format_unit(metric)}", note)]
         for column, score in enumerate(scores):
             if score is None:
