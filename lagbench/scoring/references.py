@@ -127,7 +127,7 @@ def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
         rows = {}
         for name in job.references:
             frames = predict_reference(REFERENCES[name], given)
-            timed = _time_frames(frames, seconds[name])
+            timed = time_frames(frames, seconds[name])
             rows[name] = snapshots(truth.scenario, timed)
         tallies, _ = measure_rows(
             truth.scenario,
@@ -151,12 +151,12 @@ def time_references(size: Size, root: Path) -> dict[str, float]:
             given = given_in(truth.file, size, root)
         for reference in references_of(size):
             times = seconds.setdefault(reference.name, [])
-            for _ in _time_frames(predict_reference(reference, given), times):
+            for _ in time_frames(predict_reference(reference, given), times):
                 pass
     return {name: float(np.median(times)) for name, times in seconds.items()}
 
 
-def _time_frames(
+def time_frames(
     frames: Iterator[NDArray[np.float32]], seconds: list[float]
 ) -> Iterator[NDArray[np.float32]]:
     """Yield frames; append the CPU time of each to ``seconds`` [s]."""
