@@ -127,6 +127,7 @@ def _write_registry(path: Path, hashes: dict[int, str]) -> None:
     file = read_yaml(path)
     split = file["splits"]["cavity"]
     split["version"] = VERSION
+    split["sizes"]["tiny"].pop("version", None)
     size = split["sizes"]["tiny"]
     size["subsets"] = {
         "train": "0-1",
