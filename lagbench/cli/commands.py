@@ -45,7 +45,7 @@ COMMANDS = (
         "list",
         "inventory:list_command",
         "List all splits and sizes, their cost, and the data on this machine.",
-        "list cavity",
+        "list",
     ),
     Command(
         "Data",
@@ -77,16 +77,9 @@ COMMANDS = (
     ),
     Command(
         "Data",
-        "clean",
-        "clean:clean_command",
-        "Remove one data set, or only its temporary files.",
-        "clean --split cavity --size tiny --dry-run",
-    ),
-    Command(
-        "Data",
         "cite",
         "cite:cite_command",
-        "Print how to cite a split: version, hashes and original works.",
+        "Print how to cite a split, as an entry of BibTeX.",
         "cite cavity",
     ),
     Command(
@@ -95,13 +88,6 @@ COMMANDS = (
         "local_splits:import_command",
         "Make a local split from data of other programs or code bases.",
         "import runs/*.npz -o own --frame-interval 0.1",
-    ),
-    Command(
-        "Other people's data",
-        "adopt",
-        "local_splits:import_command",
-        "The same as import.",
-        "adopt runs/*.npz -o own --frame-interval 0.1",
     ),
     Command(
         "Other people's data",

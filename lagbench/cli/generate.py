@@ -57,8 +57,6 @@ def generate_command(
         gather: Take finished scenarios from another root folder; repeatable.
         dry_run: Print the cost only: bytes, time, free disk.
     """
-    if size is None and not quiet:
-        print_note(_describe_default_size(split, root))
     registry = None
     folder: str | Path | None = root
     if draw_seed is not None:
@@ -89,22 +87,6 @@ def generate_command(
         if result.complete and draw_seed is None:
             lines += recording_hint(result.split, result.size, result.root)
     print_result(result, lines, as_json=as_json, quiet=quiet)
-
-
-def _describe_default_size(split: str, root: str | Path | None) -> str:
-    """Return which size is taken where none is named, why, and which others there are.
-
-    Raises:
-        UsageError: there is no such split.
-    """
-    size, _, registry = locate_new(split, root=root)
-    others = [name for name in registry.split(size.split).sizes if name != size.name]
-    if not others:
-        return f"{size.split} {size.name}: the only size of the split"
-    return (
-        f"{size.split} {size.name}: the default, since no --size is named; the others "
-        f"are {' and '.join(others)}"
-    )
 
 
 def _describe_plan(result: GenerationResult) -> list[str]:

@@ -16,7 +16,7 @@ from lagbench.data.layout import (
     url_of,
 )
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
-from lagbench.data.registry import Registry, Size, Split, load
+from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, escape_line, hide_credentials
 from lagbench.make.cards import describe_truth_error
 from lagbench.make.inventory import Overview, overview
@@ -55,19 +55,8 @@ LEGEND = (
 """Lines that say what the columns mean."""
 
 
-def list_command(
-    split: str | None = None, *, root: RootOption = None, as_json: JsonFlag = False
-) -> None:
-    """List all splits and sizes, their cost, and the data on this machine.
-
-    For one split it also shows the scores of the reference predictors.
-
-    Args:
-        split: One split, by its name or folder; all splits by default.
-    """
-    if split is not None:
-        _list_split(split, root=root, as_json=as_json)
-        return
+def list_command(*, root: RootOption = None, as_json: JsonFlag = False) -> None:
+    """List all splits and sizes, their cost, and the data on this machine."""
     folder = resolve_root(root)
     overviews = _list_overviews(folder)
     if as_json:
@@ -79,40 +68,6 @@ def list_command(
     print_line(
         f"folder of all data sets: {hide_credentials(url_of(folder) or str(folder))}"
     )
-
-
-def _list_split(split: str, *, root: str | Path | None, as_json: bool) -> None:
-    """Show the sizes of one split and the references that were measured on them."""
-    # the table of all splits needs no references, which take longer to load
-    from .reference_scores import measured_references, print_references
-
-    name, folder, registry = locate_split(split, root=root)
-    entry = registry.split(name)
-    sizes = [registry.size(name, size) for size in entry.sizes]
-    overviews = _overviews_of_split(registry, name, folder)
-    references = {size.name: measured_references(size) for size in sizes}
-    if as_json:
-        print_json({"root": folder, "sizes": overviews, "references": references})
-        return
-
-    _print_title(name, entry)
-    rows = [_format_row(size_overview)[1:] for size_overview in overviews]
-    print_table("", COLUMNS[1:], rows)
-    for line in LEGEND:
-        print_line(line)
-    print_line("")
-    print_references(sizes, references)
-    print_line(f"all parameters: lagbench info {split}")
-    print_line(
-        f"folder of all data sets: {hide_credentials(url_of(folder) or str(folder))}"
-    )
-
-
-def _print_title(name: str, entry: Split) -> None:
-    """Print title, name, version and licence; strangers describe local splits."""
-    title = escape_line(entry.title)
-    licence = escape_line(entry.licence)
-    print_line(f"{title} ({name} {entry.version}, {licence})")
 
 
 def _list_overviews(folder: Path) -> list[Overview]:
@@ -194,7 +149,10 @@ def info_command(
         return
 
     description = textwrap.fill(entry.description, TEXT_WIDTH, break_on_hyphens=False)
-    _print_title(name, entry)
+    # Strangers describe local splits.
+    title = escape_line(entry.title)
+    licence = escape_line(entry.licence)
+    print_line(f"{title} ({name} {entry.version}, {licence})")
     for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
         for line in _describe_size(shown_size, size_overview):
             print_line(line)

@@ -39,14 +39,13 @@ from .options import (
 )
 from .output import (
     format_bytes,
-    note_at_start,
     print_json,
     print_line,
     print_result,
     print_tables,
     progress_bar,
 )
-from .solver_bench import try_bench
+from .solver_bench import time_solver
 from .stderr import print_on_stderr
 
 EveryFlag = Annotated[
@@ -167,8 +166,7 @@ def reproduce_command(
     split: EntrySplitOption = None,
     size: EntrySizeOption = None,
     scenarios: int | None = None,
-    costs: bool = False,
-    no_costs: bool = False,
+    costs: Annotated[bool | None, Parameter(negative="--no-costs")] = None,
     again: AgainFlag = False,
     recording: Annotated[
         bool, Parameter(name="--record", negative="--no-record")
@@ -192,15 +190,12 @@ def reproduce_command(
     Args:
         entries: SPLIT/SIZE/METHOD, as in cavity/mini/gns.
         scenarios: Predict a sample of so many scenarios; all by default.
-        costs: Measure costs only, on a quiet machine.
-        no_costs: Measure no costs.
+        costs: Measure costs only, on a quiet machine; or no costs. Default: both.
         recording: Write the result to verified.yaml.
         threads: Threads of a model on the CPU.
     """
     if bool(entries) == every:
         raise UsageError("name entries, as in cavity/mini/gns, or give --all")
-    if costs and no_costs:
-        raise UsageError("--costs and --no-costs exclude each other; leave one out")
     if scenarios is not None and scenarios < 1:
         raise UsageError(f"--scenarios {scenarios} predicts nothing; give 1 or more")
     if draw_seed is not None:
@@ -224,22 +219,17 @@ def reproduce_command(
         print_result(scores, blind_lines, as_json=as_json, quiet=quiet)
         return 0
     folder = find_board(board)
-
-    def time_solver(split: str, size: str) -> float | None:
-        solver = try_bench(split, size, warning="the solver is not timed")
-        return solver.seconds_per_frame if solver else None
-
+    with_scores = costs is not True
+    with_costs = costs is not False
     with progress_bar(quiet=quiet or as_json) as progress:
-        if recording and not quiet:
-            progress = note_at_start(f"results go to {folder}", progress)
         result = reproduce(
             folder,
             entries or (),
             split=split,
             size=size,
             scenarios=scenarios,
-            scores=not costs,
-            costs=not no_costs,
+            scores=with_scores,
+            costs=with_costs,
             again=again,
             recording=recording,
             threads=threads,
@@ -250,7 +240,7 @@ def reproduce_command(
     if not as_json:
         for failure in result.failures:
             print_on_stderr(f"{failure.entry}: {failure.error}")
-    lines = _describe_reproduced(result, with_scores=not costs, with_costs=not no_costs)
+    lines = _describe_reproduced(result, with_scores=with_scores, with_costs=with_costs)
     print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
     return result.exit_code
 
@@ -331,8 +321,6 @@ def shift_command(
         raise UsageError("name entries, as in cavity/mini/gns, or give --all")
     folder = find_board(board)
     with progress_bar(quiet=quiet or as_json) as progress:
-        if not quiet:
-            progress = note_at_start(f"results go to {folder}", progress)
         result = score_on_shift(
             folder,
             entries or (),

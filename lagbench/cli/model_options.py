@@ -10,17 +10,14 @@ from lagbench.data.local import locate_split
 from lagbench.data.registry import NO_GENERATOR
 from lagbench.errors import check_installed
 
-PREDICTION_LIBRARIES = ("torch", "torch_geometric")
-TRAINING_LIBRARIES = (*PREDICTION_LIBRARIES,)
 
-
-def require_libraries(names: tuple[str, ...]) -> None:
+def require_libraries() -> None:
     """Refuse to go on without the libraries of reference models.
 
     Raises:
         UsageError: one of them is not installed.
     """
-    for name in names:
+    for name in ("torch", "torch_geometric"):
         check_installed(name, extra="baselines")
 
 

@@ -25,8 +25,6 @@ from lagbench.work.run import Progress, silence, watched
 from .stderr import print_on_stderr
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as ProgressDisplay
-
     from lagbench.submission.issues import ValidationResult
 
 PIPE_WIDTH = 120  # width of the output where it is no terminal [characters]
@@ -200,7 +198,18 @@ def progress_bar(
         yield _print_lines(unit, seconds_per_line)
         return
 
-    with _bar_on_stderr() as display:
+    # Commands without a bar do not load its library.
+    from rich import progress as bars
+
+    columns = (
+        bars.TextColumn("{task.description}"),
+        bars.BarColumn(),
+        bars.TaskProgressColumn(),
+        bars.TextColumn("{task.fields[count]}"),
+        bars.TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with bars.Progress(*columns, console=console, transient=True) as display:
         task = display.add_task("starting", total=None, count="")
 
         def update_bar(progress: Progress) -> None:
@@ -213,43 +222,6 @@ def progress_bar(
             )
 
         yield update_bar
-
-
-def _bar_on_stderr() -> ProgressDisplay:
-    """Return a progress bar; commands without one do not load its library."""
-    from rich import progress
-
-    columns = (
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.TaskProgressColumn(),
-        progress.TextColumn("{task.fields[count]}"),
-        progress.TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    return progress.Progress(*columns, console=console, transient=True)
-
-
-def note_at_start(note: str, listener: Listener | None) -> Listener:
-    """Return a listener that prints a note before the first progress.
-
-    Work that is refused makes no progress, so its user reads the error alone.
-
-    Args:
-        note: what the command says as its work begins.
-        listener: shows all progress, the first one too; may be None.
-    """
-    has_begun = False
-
-    def show_progress(progress: Progress) -> None:
-        nonlocal has_begun
-        if not has_begun:
-            has_begun = True
-            print_note(note)
-        if listener is not None:
-            listener(progress)
-
-    return show_progress
 
 
 def _print_lines(unit: str, seconds_per_line: float) -> Listener:

@@ -14,7 +14,7 @@ from lagbench.data.layout import quote_root
 from lagbench.data.registry import load
 from lagbench.errors import UsageError, check_regular, format_count
 
-from .model_options import PREDICTION_LIBRARIES, require_libraries
+from .model_options import require_libraries
 from .options import (
     DeviceOption,
     JsonFlag,
@@ -25,12 +25,11 @@ from .options import (
     ThreadsOption,
 )
 from .output import print_result, progress_bar
-from .solver_bench import SolverBench, try_bench
-
-LARGEST_SEED = 2**31 - 1
+from .solver_bench import time_solver
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
+    from lagbench.models.predict_onnx import OnnxPredictionResult
 
 
 def predict_command(
@@ -70,8 +69,7 @@ def predict_command(
             default.
         bench: Time our solver too, for the speed-up.
     """
-    solver_clock = _SolverClock(quiet=quiet)
-    time_solver = solver_clock if bench else None
+    clock = time_solver if bench else None
     if checkpoint.suffix == ".onnx":
         check_regular(checkpoint)
         has_other_device = device not in ("auto", "cpu") or threads not in (None, 1)
@@ -93,27 +91,26 @@ def predict_command(
                 method=method,
                 seed=seed or 0,
                 root=root,
-                time_solver=time_solver,
+                time_solver=clock,
                 progress=progress,
             )
-        value = {**vars(onnx_result), "solver": solver_clock.bench}
         lines = [
             f"{onnx_result.path}: {onnx_result.method}, "
             f"{format_count(onnx_result.scenarios, 'scenario')}, "
             f"{onnx_result.frames} frames",
             f"  model   {onnx_result.seconds_per_frame:.3g} s per frame: processor "
             "time of one thread, mean over all predicted frames",
-            *_describe_solver(onnx_result.seconds_per_frame, solver_clock.bench),
+            *_describe_solver(onnx_result),
             _next_command(onnx_result.path, split, root),
         ]
-        print_result(value, lines, as_json=as_json, quiet=quiet)
+        print_result(onnx_result, lines, as_json=as_json, quiet=quiet)
         return
 
     if seed is not None:
         raise UsageError(
             "weights state the seed of their training; leave it out", where="--seed"
         )
-    require_libraries(PREDICTION_LIBRARIES)
+    require_libraries()
     from lagbench.baselines.predict import predict
 
     is_replaced = output.is_file()
@@ -131,40 +128,17 @@ def predict_command(
             threads=threads,
             batch=batch,
             method=method,
-            time_solver=time_solver,
+            time_solver=clock,
             progress=progress,
         )
-    solver = solver_clock.bench
     lines = [
-        *_describe(result, solver=solver, is_replaced=is_replaced),
+        *_describe(result, is_replaced=is_replaced),
         _next_command(result.path, split, root),
     ]
-    value = {**vars(result), "solver": solver}
-    print_result(value, lines, as_json=as_json, quiet=quiet)
+    print_result(result, lines, as_json=as_json, quiet=quiet)
 
 
-class _SolverClock:
-    """Times our solver when it is called, and keeps the result."""
-
-    def __init__(self, *, quiet: bool) -> None:
-        self.quiet = quiet
-        self.bench: SolverBench | None = None
-
-    def __call__(self, split: str, size: str) -> float | None:
-        """Return the time of a frame [s]; None where the solver cannot run."""
-        warning = None if self.quiet else "no speed-up over the solver"
-        self.bench = try_bench(split, size, warning=warning)
-        if self.bench is None:
-            return None
-        return self.bench.seconds_per_frame
-
-
-def _describe(
-    result: PredictionResult,
-    *,
-    solver: SolverBench | None,
-    is_replaced: bool,
-) -> Iterator[str]:
+def _describe(result: PredictionResult, *, is_replaced: bool) -> Iterator[str]:
     method_parts = [result.method]
     if result.trained_size != result.size:
         method_parts.append(f"trained at {result.trained_size}")
@@ -182,7 +156,7 @@ def _describe(
     if result.clock != "wall":
         clock = f"processor time of {format_count(result.threads, 'thread')}; {clock}"
     yield f"          {clock}"
-    yield from _describe_solver(result.seconds_per_frame, solver)
+    yield from _describe_solver(result)
     if result.diverged:
         marks = []
         for scenario, frame in result.diverged.items():
@@ -191,17 +165,18 @@ def _describe(
 
 
 def _describe_solver(
-    seconds_per_frame: float, solver: SolverBench | None
+    result: PredictionResult | OnnxPredictionResult,
 ) -> Iterator[str]:
     """Yield the time of our solver, and how much faster one of both is."""
-    if solver is None:
+    solver_seconds = result.solver_seconds_per_frame
+    if solver_seconds is None:
         return
-    ratio = seconds_per_frame / solver.seconds_per_frame
+    ratio = result.seconds_per_frame / solver_seconds
     speeds = f"{ratio:.2g} times as fast as the model"
     if ratio < 1.0:
         speeds = f"the model is {1.0 / ratio:.2g} times as fast"
     yield (
-        f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this "
+        f"  solver  {solver_seconds:.3g} s per frame on one core of this "
         f"machine: {speeds}"
     )
 

@@ -12,10 +12,8 @@ from lagbench.data.local import locate_split
 from lagbench.errors import UsageError
 from lagbench.figures.report.report import check_folder, write_report
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.score import check_extras, score, scores_folder
+from lagbench.scoring.score import check_extras, score
 from lagbench.scoring.tables import brief_table, card_lines, card_tables
-from lagbench.submission.issues import ValidationResult
-from lagbench.submission.validation import validate
 
 from .options import (
     ExpectedSplitOption,
@@ -51,8 +49,7 @@ def score_command(
 
     Args:
         predictions: A predictions.nc; several with --report.
-        output: Folder of the scores; by default gns/ beside gns.nc. With several files,
-            each gets a folder in it, named after the file.
+        output: Folder of the scores; by default gns/ beside gns.nc.
         report: Write index.html with all figures there.
         extras: Also compute the metrics of these extras, as in transport.
         every: Show every metric, frame of interest, scenario and reference predictor.
@@ -65,28 +62,30 @@ def score_command(
             "or score one after the other",
             where="FILE",
         )
-    folders = _score_folders(predictions, output)
+    if len(predictions) > 1 and output is not None:
+        raise UsageError(
+            "the scores of several files lie beside each of them; leave it out",
+            where="--output",
+        )
     data_root: str | Path | None = root
     if split is not None:
         data_root = locate_split(split, root=root).root
-    validations = _validate_together(predictions, data_root)
     if report is not None:
         check_folder(report)
 
     cards = []
-    for path, folder, validation in zip(predictions, folders, validations, strict=True):
+    for path in predictions:
         with progress_bar(quiet=quiet) as progress:
             card = score(
                 path,
                 split=split,
                 root=data_root,
-                output_dir=folder,
+                output_dir=output,
                 workers=workers,
                 scheduler=scheduler,
                 extras=extra_names,
                 progress=progress,
                 examined=print_errors,
-                validated=validation,
             )
         cards.append(card)
 
@@ -117,61 +116,3 @@ def _print_cards(cards: Sequence[ScoreCard], *, every: bool) -> None:
         print_line(f"written: {', '.join(map(str, card.files))}")
     if not every:
         print_line("more: --all shows every metric, frame of interest and scenario")
-
-
-def _score_folders(
-    predictions: Sequence[Path], output: Path | None
-) -> Sequence[Path | None]:
-    """Return the folder for the scores of each file; None stands for the default.
-
-    Raises:
-        UsageError: the scores of two files would go to one folder.
-    """
-    if len(predictions) == 1:
-        return [output]
-    folders = []
-    files_by_folder: dict[Path, Path] = {}
-    for path in predictions:
-        folder = scores_folder(path)
-        if output is not None:
-            folder = output / folder.name
-        folders.append(folder)
-        other_path = files_by_folder.setdefault(folder.resolve(), path)
-        if other_path is not path:
-            raise UsageError(
-                f"the scores of two files would go to one folder: {other_path} and "
-                f"{path}; name each file once, give the files different names, or "
-                "leave --output out",
-                where=str(folder),
-            )
-    return folders
-
-
-def _validate_together(
-    predictions: Sequence[Path], root: str | Path | None
-) -> Sequence[ValidationResult | None]:
-    """Return the validation of each of several files, before the first is scored.
-
-    A single file has None: it is validated as it is scored.
-
-    Raises:
-        UsageError: the files are for different data sets.
-        LagbenchError: a file is invalid.
-    """
-    if len(predictions) == 1:
-        return [None]
-    results: list[ValidationResult] = []
-    for path in predictions:
-        result = validate(path, root=root, require_truth=True)
-        print_errors(result)
-        result.check()
-        results.append(result)
-        first = results[0]
-        if (result.split, result.size) != (first.split, first.size):
-            raise UsageError(
-                f"one report, two data sets: got {result.split} {result.size}, "
-                f"expected {first.split} {first.size}, as in {first.path}; write one "
-                "report for each data set",
-                where=str(path),
-            )
-    return results

@@ -37,7 +37,7 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     """Simulate the first test scenario and time its frames.
 
     The engine starts once per process: call this from a process of its own, as
-    :func:`bench_in_own_process` does.
+    :func:`time_solver` does.
 
     Args:
         split: name of a split.
@@ -69,41 +69,26 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     )
 
 
-def bench_in_own_process(split: str, size: str) -> SolverBench:
-    """Time the solver in a process of its own.
+def time_solver(split: str, size: str) -> float | None:
+    """Return the time of a frame [s]; None, with a warning, where it cannot run.
 
-    The memory and the threads of this process do not disturb it there.
+    It runs in a process of its own, where the memory and the threads of this process do
+    not disturb it. Local splits have no solver, which is no reason for a warning.
     """
-    load().size(split, size)
-    find_engine()
+    if split not in load().splits:
+        return None
     item = WorkItem(
         name=f"bench of {split} {size}", function=_bench, argument=(split, size)
     )
-    (finished,) = run_items([item])
-    result: SolverBench = finished.value
-    return result
+    try:
+        find_engine()
+        (finished,) = run_items([item])
+    except LagbenchError as error:
+        print_warning(f"our solver is not timed: {error}")
+        return None
+    bench: SolverBench = finished.value
+    return bench.seconds_per_frame
 
 
 def _bench(place: tuple[str, str], _: Report) -> SolverBench:
     return bench_solver(*place)
-
-
-def try_bench(split: str, size: str, *, warning: str | None) -> SolverBench | None:
-    """Time the solver in a process of its own; None where it cannot run.
-
-    Local splits have no solver, which is no reason for a warning.
-
-    Args:
-        split: name of a split.
-        size: name of a size.
-        warning: what is missing without the time, to warn of it with the reason; None
-            warns of nothing.
-    """
-    if split not in load().splits:
-        return None
-    try:
-        return bench_in_own_process(split, size)
-    except LagbenchError as error:
-        if warning is not None:
-            print_warning(f"{warning}: {error}")
-        return None

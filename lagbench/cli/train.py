@@ -18,11 +18,7 @@ from lagbench.errors import LagbenchError, format_count
 from lagbench.scoring.scorability import check_scorability
 from lagbench.submission.budget import EQUAL_MINUTES
 
-from .model_options import (
-    TRAINING_LIBRARIES,
-    data_option,
-    require_libraries,
-)
+from .model_options import data_option, require_libraries
 from .options import (
     DeviceOption,
     JsonFlag,
@@ -72,7 +68,7 @@ def train_command(
             seed.
         fresh: Start anew and replace an earlier training.
     """
-    require_libraries(TRAINING_LIBRARIES)
+    require_libraries()
     # Torch takes seconds to load, so the data are looked for before. Of several
     # processes only the first does it, for an error to be printed once.
     if "LOCAL_RANK" not in os.environ:

@@ -355,7 +355,6 @@ def locate(
     *,
     root: str | Path | None = None,
     registry: Registry | None = None,
-    is_chosen_of_several: bool = True,
 ) -> SizeLocation:
     """Return one size of the split that a user means, and the place of its data.
 
@@ -365,8 +364,6 @@ def locate(
             one with data; where several have data it is mini.
         root: folder of all data sets.
         registry: the other splits; ours when None.
-        is_chosen_of_several: whether mini is taken where several sizes have data. What
-            removes data must not choose.
 
     Raises:
         UsageError: see :func:`locate_split`; the split has no such size, or none is
@@ -376,7 +373,7 @@ def locate(
     """
     location = locate_split(split, root=root, registry=registry)
     if size is None:
-        size = _size_with_data(location, is_chosen_of_several=is_chosen_of_several)
+        size = _size_with_data(location)
     tier = location.registry.size(location.name, size)
     return SizeLocation(tier, location.root, location.registry)
 
@@ -408,7 +405,7 @@ def _size_to_make(location: SplitLocation) -> str:
     return next(iter(sizes))
 
 
-def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> str:
+def _size_with_data(location: SplitLocation) -> str:
     """Return the only size of a split, or the only one with data; of several mini."""
     split, root, registry = location
     sizes = []
@@ -426,7 +423,7 @@ def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> s
         return names[0]
     if len(sizes) == 1:
         return sizes[0].name
-    if DEFAULT_NEW_SIZE in names and is_chosen_of_several:
+    if DEFAULT_NEW_SIZE in names:
         return DEFAULT_NEW_SIZE
     all_names = ", ".join(size.name for size in sizes)
     if names:
@@ -437,7 +434,7 @@ def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> s
         )
     size = registry.size(split, _size_to_make(location))
     hint = suggest_repair(size, root=root)
-    if url_of(root) is not None or not is_chosen_of_several:
+    if url_of(root) is not None:
         hint = f"name one: --size {DEFAULT_NEW_SIZE}"
     raise DataError(
         f"no size is named, and none of {all_names} is there; {hint}", where="--size"

@@ -613,7 +613,7 @@ class Registry:
             names = " or ".join(parent.sizes)
             raise UsageError(
                 f"split {split!r} has no size {name!r}: expected {names}; name "
-                f"{names}; `lagbench list {split}` says what they cost",
+                f"{names}; `lagbench info {split}` says what they cost",
                 where="--size",
             )
         entry = parent.sizes[name]

@@ -27,7 +27,6 @@ from lagbench.data.registry import load
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.make.clean import clean
 from lagbench.make.verify import verify
 
 
@@ -166,11 +165,6 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
         with pytest.raises(DataError) as damaged:
             reading("cavity", subset="test", root=tmp_path)
         assert damaged.value.where == str(mini_folder.parent)
-    # Nothing is removed by a default.
-    with pytest.raises(UsageError) as unnamed:
-        clean("cavity", root=tmp_path)
-    assert unnamed.value.where == "--size"
-    assert (mini_folder / "0000.nc").exists()
     # Where a split has no mini, its only size is the default.
     new = locate_new("own", root=own.parent)
     old = locate("own", root=own.parent)

@@ -139,34 +139,6 @@ def test_several_files_keep_their_scores(
     assert [path.name for path in report.iterdir()] == ["index.html"]
 
 
-def test_two_files_never_share_a_folder_of_scores(
-    run: Run, two_submissions: list[Path], tmp_path: Path
-) -> None:
-    """It is a usage error before any is scored."""
-    report = tmp_path / "report"
-    first, second = two_submissions
-    for arguments in (
-        (first, second, "--output", report),
-        (first, first),
-    ):
-        result = run("score", *arguments, "--report", report)
-        assert result.exit_code == 2
-    assert not report.exists()
-    assert [path.name for path in first.parent.iterdir()] == ["p.nc"]
-
-
-def test_all_files_are_read_before_any_is_scored(
-    run: Run, two_submissions: list[Path], tmp_path: Path
-) -> None:
-    report = tmp_path / "report"
-    first, second = two_submissions
-    second.write_text("text")
-    result = run("score", first, second, "--report", report)
-    assert result.exit_code == 3
-    assert not (first.parent / "p").exists()
-    assert not report.exists()
-
-
 @pytest.mark.parametrize("option", ["--output", "--report"])
 def test_an_unusable_folder_is_an_error_before_the_work(
     run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch, option: str
