@@ -94,7 +94,14 @@ class Baseline(nn.Module):
 
     def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()
-        self._check_box(info.box, where=f"the box of {info.split} {info.size}")
+        is_walled_square = info.box.dimension == 2 and not info.box.is_periodic
+        if not (self.any_box or is_walled_square):
+            raise UsageError(
+                f"{self.method} knows boxes of two dimensions between walls only; "
+                "train neuralmpm, or a graph network such as gns; or state any_box = "
+                "True in its class",
+                where=f"the box of {info.split} {info.size}",
+            )
         if info.wall_particles and not self.knows_wall_particles:
             raise UsageError(
                 f"{self.method} knows no particles of walls; train neuralmpm or a "
@@ -105,38 +112,6 @@ class Baseline(nn.Module):
         self.options = options
         self.info = info
         self.box = TensorBox(info.box)
-
-    @classmethod
-    def check_data_set(
-        cls, split: str, size: str, box: Box, *, is_full_box: bool
-    ) -> None:
-        """Refuse a data set that no recipe makes fit for the model.
-
-        A training calls it before it looks for a recipe.
-
-        Args:
-            split: name of the split.
-            size: name of the size.
-            box: box of the data set.
-            is_full_box: whether the matter fills the box.
-
-        Raises:
-            UsageError: the model does not know such data.
-        """
-        cls._check_box(box, where=f"the box of {split} {size}")
-
-    @classmethod
-    def _check_box(cls, box: Box, *, where: str) -> None:
-        """Refuse a periodic box or a cube if the model does not know them."""
-        if cls.any_box:
-            return
-        if box.is_periodic or box.dimension != 2:
-            raise UsageError(
-                f"{cls.method} knows boxes of two dimensions between walls only; train "
-                "neuralmpm, or a graph network such as gns; or state any_box = True in "
-                "its class",
-                where=where,
-            )
 
     @classmethod
     def build(cls, options: Mapping[str, object], info: DatasetInfo) -> Self:

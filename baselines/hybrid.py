@@ -6,6 +6,7 @@ fits hybrids any more, but the committed weights predict as before.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 from torch import Tensor
 
-from lagbench.data.box import Box
 from lagbench.errors import DataError, UsageError
 
 from .baseline import Baseline, Batch, Options
@@ -39,22 +39,6 @@ class Hybrid(Baseline):
 
     coefficients: Tensor
 
-    @classmethod
-    def check_data_set(
-        cls, split: str, size: str, box: Box, *, is_full_box: bool
-    ) -> None:
-        """Refuse a training.
-
-        Raises:
-            UsageError: always.
-        """
-        del box, is_full_box
-        raise UsageError(
-            f"{cls.method} is fitted no more; calibrated rows take its place: "
-            "python -m lagbench.scoring.calibrate",
-            where=f"{split} {size}",
-        )
-
     @property
     def history(self) -> int:
         """Given frames that the solver reads: the last two."""
@@ -64,6 +48,18 @@ class Hybrid(Baseline):
         """Return no loss: nothing is trained."""
         del batch, generator
         return {}
+
+    def fit(self, scenarios: object) -> Mapping[str, float]:
+        """Refuse a training.
+
+        Raises:
+            UsageError: always.
+        """
+        del scenarios
+        raise UsageError(
+            f"{self.method} is fitted no more; calibrated rows take its place: "
+            "python -m lagbench.scoring.calibrate"
+        )
 
     def checked_coefficients(self) -> NDArray[np.float64]:
         """Return the coefficients [1], shape [coefficient].

@@ -24,7 +24,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 from torch import Tensor
 
 from lagbench.data.box import Box, keep_outside
@@ -43,6 +42,7 @@ STABLE_DECAY = 1.6
 """Time step times the fastest rate of decay, at most; Heun's scheme allows 2."""
 
 CLOSURE = 3  # number of the coefficients a, b, c
+RESOLUTION = 2.0  # cells over those of the score grid, along each axis
 
 
 class ClosedGrid(StaggeredGrid):
@@ -173,25 +173,15 @@ class ProjectedFlow:
             )
 
 
-class HybridProjectionOptions(HybridOptions):
-    """Options of the hybrid."""
-
-    of_weights = frozenset({"resolution"})
-
-    # cells over those of the score grid, along each axis
-    resolution: float = Field(default=2.0, gt=0.0, le=4.0, allow_inf_nan=False)
-
-
 class HybridProjection(Hybrid):
     """The projection solver with a learned viscous closure."""
 
     method = "hybrid projection"
     largest = 2.0  # more would need very many time steps
 
-    Options = HybridProjectionOptions
-    options: HybridProjectionOptions
+    Options = HybridOptions
 
-    def __init__(self, options: HybridProjectionOptions, info: DatasetInfo) -> None:
+    def __init__(self, options: HybridOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         self.channel: Size | None = None
         split = load_registry().splits.get(info.split)
@@ -231,7 +221,7 @@ class HybridProjection(Hybrid):
         obstacle = read(given.obstacle)
 
         coefficients = self.checked_coefficients()
-        cells_per_length = self.options.resolution * self.info.score_cells
+        cells_per_length = RESOLUTION * self.info.score_cells
         cells = [max(4, round(cells_per_length * length)) for length in box.lengths]
         spacing = float((box.lengths / np.asarray(cells)).min())
         # In float64, as the solver computes: its steps may hang on the last digit.

@@ -27,8 +27,6 @@ class LSTMOptions(FrameNetworkOptions):
 
     # length of the latent vector of a frame and width of both LSTM layers
     latent: PositiveInt = 1250
-    # widths of pointwise layers before the latent one
-    encoder: tuple[PositiveInt, ...] = ()
     # widths of hidden layers after the second LSTM layer
     decoder: tuple[PositiveInt, ...] = (1250,)
     # after the first and after the second LSTM layer
@@ -58,11 +56,10 @@ class LSTM(FrameNetwork):
         super().__init__(options, info)
         self.grid: ParticleGrid | None = score_grid(info)
         latent = options.latent
-        encoder_widths = (self.input_features, *options.encoder, latent)
         decoder_widths = (latent, *options.decoder, self.features)
 
-        encoder_layers = dense(encoder_widths, Activation.ELU)
-        self.encoder = nn.Sequential(*encoder_layers, nn.ELU())
+        encoder_layer = nn.Linear(self.input_features, latent)
+        self.encoder = nn.Sequential(encoder_layer, nn.ELU())
         self.first = nn.LSTM(latent, latent, batch_first=True)
         self.between: nn.Module | None = None
         if self.interleaved:

@@ -22,24 +22,13 @@ class ProcessorLayer(nn.Module):
         a_i &= \mathrm{Operator}(s, m)_i \\
         x_i &\leftarrow x_i + \mathrm{LayerNorm}(\mathrm{MLP}([x_i \Vert a_i]))
 
-    MLPs have two hidden layers. Where messages are not summed, :math:`s_i = x_i`.
+    MLPs have two hidden layers.
     """
 
-    def __init__(
-        self,
-        operator: type[Operator],
-        *,
-        latent: int,
-        hidden: int,
-        sum_messages: bool = True,
-    ) -> None:
+    def __init__(self, operator: type[Operator], *, latent: int, hidden: int) -> None:
         super().__init__()
-        self.sum_messages = sum_messages
         self.message = EdgeMLP(latent, hidden)
-        operator_inputs = latent
-        if sum_messages:
-            operator_inputs = 2 * latent
-        self.operator = operator(operator_inputs, latent, hidden)
+        self.operator = operator(2 * latent, latent, hidden)
         self.update = mlp([2 * latent, hidden, hidden, latent])
 
     def forward(
@@ -52,7 +41,7 @@ class ProcessorLayer(nn.Module):
         """Return updated nodes and edges and the operator's own losses."""
         message = self.message(edge, node, edge_index)
         operator_input = node
-        if self.sum_messages and self.operator.reads_nodes:
+        if self.operator.reads_nodes:
             message_sum = sum_edges(edge_index, message, len(node))
             operator_input = torch.cat([node, message_sum], dim=-1)
 
@@ -92,7 +81,6 @@ class EncodeProcessDecode(LayeredNetwork):
         edge_features: int,
         latent: int = 128,
         layers: int = 10,
-        sum_messages: bool = True,
         outputs: int = 2,
     ) -> None:
         super().__init__()
@@ -100,12 +88,7 @@ class EncodeProcessDecode(LayeredNetwork):
         self.edge_encoder = mlp([edge_features, latent, latent, latent])
         self.processor = nn.ModuleList()
         for _ in range(layers):
-            layer = ProcessorLayer(
-                operator,
-                latent=latent,
-                hidden=latent,
-                sum_messages=sum_messages,
-            )
+            layer = ProcessorLayer(operator, latent=latent, hidden=latent)
             self.processor.append(layer)
         self.decoder = mlp([latent, latent, latent, outputs], norm=False)
 

@@ -82,10 +82,7 @@ class Optimisation:
     @property
     def learning_rate(self) -> float:
         """Rate of the next step."""
-        factor = self.options.schedule.factor_at(
-            self.step, steps=self.steps, warmup=self.options.warmup_steps
-        )
-        return self._base_rate * factor
+        return self._base_rate * self.options.rate_factor(self.step, steps=self.steps)
 
     def weigh(self, terms: Mapping[str, Tensor]) -> Tensor:
         """Return the loss, the weighted sum of the terms; keep the terms.

@@ -23,12 +23,11 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
 from pydantic import (
     BaseModel,
-    BeforeValidator,
     Field,
     ValidationError,
     field_validator,
@@ -42,45 +41,11 @@ from lagbench.errors import UnreadableFileError, UsageError
 from .baseline import Settings
 from .catalogue import CatalogueEntry
 
+DECAY_STEPS = 5_000_000
+"""Steps in which the exponential rate falls to a tenth, as in the thesis."""
 
-class Schedule(Settings):
-    """Learning rate over the steps, as a factor on the recipe's rate.
-
-    ``constant`` 1; ``cosine`` (1 + cos(pi t)) / 2 falling to ``floor``, t from 0 to 1
-    after the warm-up; ``exponential`` factor^(step / every). A warm-up rises linearly
-    before.
-    """
-
-    # its name; a recipe may give it alone
-    kind: Literal["constant", "cosine", "exponential"] = "constant"
-    factor: float = Field(default=0.1, gt=0, le=1)  # of the exponential decay
-    # steps in which it decays by the factor
-    every: int = Field(default=5_000_000, gt=0)
-    # share of the rate that the cosine ends at
-    floor: float = Field(default=0.01, ge=0, le=1)
-
-    def factor_at(self, step: int, *, steps: int, warmup: int = 0) -> float:
-        """Return the factor on the learning rate at a step, counted from 0.
-
-        >>> cosine = Schedule(kind="cosine", floor=0)
-        >>> [cosine.factor_at(step, steps=4) for step in (0, 2, 4)]
-        [1.0, 0.5, 0.0]
-        >>> decay = Schedule(kind="exponential", factor=0.1, every=100)
-        >>> decay.factor_at(200, steps=1000)
-        0.010000000000000002
-        """
-        warmup_share = (step + 1) / (warmup + 1)
-        rise = min(1.0, warmup_share)
-        if self.kind == "exponential":
-            decay = self.factor ** (step / self.every)
-            return float(rise * decay)
-        if self.kind == "constant":
-            return rise
-        steps_since_warmup = max(0, step - warmup)
-        cosine_steps = max(1, steps - warmup)
-        progress = min(1.0, steps_since_warmup / cosine_steps)
-        cosine = (1 + math.cos(math.pi * progress)) / 2
-        return rise * (self.floor + (1 - self.floor) * cosine)
+COSINE_FLOOR = 0.01
+"""Share of the rate that the cosine ends at."""
 
 
 # share of a training's processor time that validations may take
@@ -94,13 +59,6 @@ Measured on mini: graph networks 1.5 to 2.4 (with bfloat16 in training alone), N
 """
 
 
-def _expand_schedule(value: object) -> object:
-    """Return the options of a schedule; a recipe may give its kind alone."""
-    if isinstance(value, str):
-        return {"kind": value}
-    return value
-
-
 class TrainingOptions(Settings):
     """Options of a training; recipes fill them."""
 
@@ -112,8 +70,8 @@ class TrainingOptions(Settings):
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
     # decoupled (AdamW) where it is above 0
     weight_decay: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    # the rate over the steps
-    schedule: Annotated[Schedule, BeforeValidator(_expand_schedule)] = Schedule()
+    # the rate over the steps, see `rate_factor`
+    schedule: Literal["constant", "cosine", "exponential"] = "constant"
     warmup_steps: int = Field(default=0, ge=0)  # steps over which the rate rises from 0
     # share of itself that the running mean of the weights keeps in a step, less at
     # first: n / (n + 9) after n steps. The mean is validated and published; with 0
@@ -174,6 +132,30 @@ class TrainingOptions(Settings):
         windows_per_step = self.batch * processes
         epochs = self.epochs or 1.0
         return max(1, math.ceil(epochs * windows / windows_per_step))
+
+    def rate_factor(self, step: int, *, steps: int) -> float:
+        """Return the factor on the learning rate at a step, counted from 0.
+
+        ``constant`` 1; ``cosine`` (1 + cos(pi t)) / 2 falling to 0.01, t from 0 to 1
+        after the warm-up; ``exponential`` 0.1^(step / 5,000,000). A warm-up rises
+        linearly before.
+
+        Args:
+            step: steps that were made.
+            steps: steps of the whole training.
+        """
+        warmup_share = (step + 1) / (self.warmup_steps + 1)
+        rise = min(1.0, warmup_share)
+        if self.schedule == "exponential":
+            decay = 0.1 ** (step / DECAY_STEPS)
+            return float(rise * decay)
+        if self.schedule == "constant":
+            return rise
+        steps_since_warmup = max(0, step - self.warmup_steps)
+        cosine_steps = max(1, steps - self.warmup_steps)
+        progress = min(1.0, steps_since_warmup / cosine_steps)
+        cosine = (1 + math.cos(math.pi * progress)) / 2
+        return rise * (COSINE_FLOOR + (1 - COSINE_FLOOR) * cosine)
 
     def count_validations(self, steps: int, *, trained: int, rolled: int) -> int:
         """Return how many validations take at most 15 % of a training.
@@ -257,16 +239,6 @@ class _RecipeFile(_Part):
     format: Literal[1]
     family: str = ""
     recipes: dict[str, _SharedRecipe] = Field(default_factory=dict)
-
-
-def recipe_names(entry: CatalogueEntry) -> tuple[str, ...]:
-    """Return the names of a baseline's recipes, as in ``cavity/mini``.
-
-    They are in the order of its file.
-    """
-    if entry.recipes:
-        return tuple(_read_file(entry.recipes).recipes)
-    return ()
 
 
 def recipe_for(
@@ -380,8 +352,6 @@ def _merge(below: Layer, above: Layer) -> Layer:
     joined = dict(below)
     for key, value in above.items():
         lower_value = joined.get(key)
-        if key == "schedule":
-            lower_value = _expand_schedule(lower_value)
         if isinstance(value, Mapping) and isinstance(lower_value, Mapping):
             joined[key] = _merge(dict(lower_value), dict(value))
         else:
@@ -394,10 +364,10 @@ def _merge(below: Layer, above: Layer) -> Layer:
 
 
 def _parse_setting(text: str) -> Layer:
-    """Return the change by a text such as ``training.schedule.every=100``.
+    """Return the change by a text such as ``model.loss.vorticity=1``.
 
-    >>> _parse_setting("training.schedule.every=100")
-    {'training': {'schedule': {'every': 100}}}
+    >>> _parse_setting("model.loss.vorticity=1")
+    {'model': {'loss': {'vorticity': 1}}}
     """
     key, equals, value_text = text.partition("=")
     group, *path = key.strip().split(".")

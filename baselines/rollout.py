@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +30,11 @@ from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Tally, round_statistics, score, tally
 from lagbench.metrics.frame import FramePair, snapshots
 from lagbench.metrics.table import METRICS, ranking_metric, select
-from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
+from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.store.copy import scenario_files
 from lagbench.store.windows import copy_window
 from lagbench.submission.validation import MAX_DISTANCE
-from lagbench.tensors import TensorWindow, collate
+from lagbench.tensors import collate
 from lagbench.torch import tensors
 
 from .baseline import Baseline, Batch, DatasetInfo
@@ -176,52 +177,51 @@ def scenario_batch(
     """
     if isinstance(paths, Path):
         paths = [paths]
-    windows = [_read_window(path, frames, viscosity) for path in paths]
-    return collate(windows)
-
-
-def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWindow:
-    """Return frames of a scenario as a window."""
-    with read_scenario(path) as file:
-        numbers = range(file.header.frames)[frames]
-        if not numbers or numbers.step != 1:
-            raise UsageError(
-                f"no consecutive frames: got {frames}, expected frames of "
-                f"0:{file.header.frames}",
-                where=str(path),
+    windows = []
+    for path in paths:
+        with read_scenario(path) as file:
+            header = file.header
+            numbers = range(header.frames)[frames]
+            if not numbers or numbers.step != 1:
+                raise UsageError(
+                    f"no consecutive frames: got {frames}, expected frames of "
+                    f"0:{header.frames}",
+                    where=str(path),
+                )
+            first = numbers.start
+            # The forcing of all later frames too: a rollout from these knows it.
+            later_frames = slice(first, None)
+            position = file.read("position", slice(first, numbers.stop))
+            material = np.zeros(position.shape[1], np.int8)
+            if "material" in file.variables:
+                material = file.read("material")
+            walls = None
+            if "wall_velocity" in file.variables:
+                walls = file.read("wall_velocity", later_frames)
+            force = None
+            if "body_force" in file.variables:
+                force = file.read("body_force", later_frames)
+            particle_mass = None
+            if "particle_mass" in file.variables:
+                particle_mass = file.read_particle_mass()
+            obstacle = parse_obstacle(
+                header.parameters, position.shape[2], where=f"{header.key}"
             )
-        first = numbers.start
-        own_frames = slice(first, numbers.stop)
-        # The forcing of all later frames too: a rollout from these knows it.
-        later_frames = slice(first, None)
-        position = file.read("position", own_frames)
-        if "material" in file.variables:
-            material = file.read("material")
-        else:
-            particles = position.shape[1]
-            material = np.zeros(particles, np.int8)
-        walls = None
-        if "wall_velocity" in file.variables:
-            walls = file.read("wall_velocity", later_frames)
-        force = None
-        if "body_force" in file.variables:
-            force = file.read("body_force", later_frames)
-        particle_mass = None
-        if "particle_mass" in file.variables:
-            particle_mass = file.read_particle_mass()
-        scenario = file.header.key.scenario
-        header = file.header
-        stated = header.viscosity
-        obstacle = parse_obstacle(
-            header.parameters, position.shape[2], where=f"{header.key}"
+        window = copy_window(
+            list(position), material, walls, header.key.scenario, first
         )
-    if stated is not None:
-        viscosity = stated
-    window = copy_window(list(position), material, walls, scenario, first)
-    window = window._replace(viscosity=viscosity, body_force=force, obstacle=obstacle)
-    return tensors(window)._replace(
-        particle_mass=particle_mass, friction=header.friction
-    )
+        stated = header.viscosity
+        window = window._replace(
+            viscosity=viscosity if stated is None else stated,
+            body_force=force,
+            obstacle=obstacle,
+        )
+        windows.append(
+            tensors(window)._replace(
+                particle_mass=particle_mass, friction=header.friction
+            )
+        )
+    return collate(windows)
 
 
 def scenario_paths(
@@ -283,25 +283,21 @@ class Validation:
                 for rollout in roll_out(model, given.to(device), horizon):
                     frames = self.task.config.predicted_frames
                     with self.task.opened(rollout.scenario) as truth:
-                        pairs = _pair_frames(rollout, truth, frames)
+                        scenario = truth.scenario
+                        predicted = snapshots(scenario, rollout.position.numpy())
+                        # one pair in memory at a time
+                        pairs = map(
+                            partial(FramePair, scenario),
+                            frames,
+                            truth.snapshots(),
+                            predicted,
+                        )
                         statistics = tally(pairs, metrics, frames)
                     tallies[rollout.scenario] = round_statistics(statistics)
         result = score(METRICS[self.metric], tallies)
         if result is None:
             return math.nan
         return result.mean
-
-
-def _pair_frames(
-    rollout: Rollout, truth: OpenScenario, frames: Sequence[int]
-) -> Iterator[FramePair]:
-    """Yield true and predicted frames, one pair in memory at a time."""
-    scenario = truth.scenario
-    predicted_frames = snapshots(scenario, rollout.position.numpy())
-    for frame, predicted, true in zip(
-        frames, predicted_frames, truth.snapshots(), strict=False
-    ):
-        yield FramePair(scenario, frame, true, predicted)
 
 
 def load_validation(

@@ -1,12 +1,11 @@
 """Graph networks that move particles: one step of features, network and integration.
 
-    a = S^-1(network(features(x, v)))        or  v' = S^-1(network(features(x, v)))
+    a = S^-1(network(features(x, v)))
     v' = v + a,   x' = x + v'                semi-implicit Euler, time in frames
 
 after Sanchez-Gonzalez et al. (2020) and thesis sections 5.6 and 5.7. Training and
 rollouts share :meth:`GraphNetwork.step`. The network's last layer starts at zero. So an
-untrained model with target acceleration adds the mean acceleration of train to every
-velocity.
+untrained model adds the mean acceleration of train to every velocity.
 
 The loss has terms of motion (acceleration, velocity and position), and in boxes of two
 dimensions without a periodic axis also of density and flow (divergence and vorticity),
@@ -18,7 +17,6 @@ around a particle. The training applies the weights.
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Self
@@ -180,11 +178,8 @@ def _node_velocity(weight: Tensor, momentum: Tensor, full: Tensor) -> Tensor:
     return torch.where(is_filled[:, None], momentum / divisor[:, None], 0.0)
 
 
-class GraphTarget(enum.StrEnum):
-    """Meaning of the network's output; untrained, it is the train mean of it."""
-
-    ACCELERATION = "acceleration"
-    VELOCITY = "velocity"
+WALL_REACH = 3.0
+"""How far a particle sees a wall [radius]: the solver's grid carries its effect."""
 
 
 class LossWeights(Options):
@@ -214,11 +209,10 @@ class GraphNetworkOptions(Options):
             "loss",
             "pushforward",
             "recovery",
-            "rollout_loss_steps",
             "symmetry",
         }
     )
-    of_weights = frozenset({"target", "sum_messages", "body_force", "obstacle"})
+    of_weights = frozenset({"body_force", "obstacle"})
     retired: ClassVar[Mapping[str, object]] = {
         "forgetful": 0.0,
         "compression": 0.0,
@@ -226,15 +220,15 @@ class GraphNetworkOptions(Options):
         "link_weight": None,
         "neighbours": None,
         "clamp": True,
+        "target": "acceleration",
+        "sum_messages": True,
+        "wall_reach": 3.0,
+        "rollout_loss_steps": 1,
     }
 
     latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
     layers: int = Field(default=10, ge=1)  # processor layers
-    # whether the sums of a node's messages are inputs of its operator; not for GNS,
-    # which is the sum itself
-    sum_messages: bool = True
     velocities: int = Field(default=5, ge=1)  # last velocities that a particle shows
-    target: GraphTarget = GraphTarget.ACCELERATION  # what the network predicts
     # deviation of the noise on the last given velocity, per component [length/frame];
     # with noise_spread the largest one. Rollouts drift away with little noise, and
     # single steps get worse with much: docs/baselines.md has figures
@@ -243,19 +237,14 @@ class GraphNetworkOptions(Options):
     # model then learns from true states and from far ones
     noise_spread: bool = False
     loss: LossWeights = LossWeights()  # weights of the terms
-    # steps over which the loss is a mean; gradients pass through all
-    rollout_loss_steps: int = Field(default=1, ge=1)
-    # largest number of own steps before those, without gradients: training then sees
-    # states of rollouts
+    # largest number of own steps, without gradients, before the step whose error
+    # counts: training then sees states of rollouts
     pushforward: int = Field(default=0, ge=0)
     # each frame the gap to the true path is to close by 1/recovery of it: a third is
     # left after so many frames; None asks for true velocities alone
     recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
     # whether the velocities of moving walls in the next frame are features
     wall_velocity: bool = False
-    # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect
-    # beyond one radius
-    wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
     # whether the force per unit mass at a particle in the next frame is a feature
     body_force: bool = False
     # whether distance and direction of an obstacle's surface are features; it is seen
@@ -301,7 +290,7 @@ class GraphNetwork(Baseline):
         self.position = self._standardisation("position", noise=0.0)
         self.velocity = self._standardisation("velocity", noise=noise)
         self.acceleration = self._standardisation("acceleration", noise=noise)
-        wall_reach = options.wall_reach * self.radius
+        wall_reach = WALL_REACH * self.radius
         self.features = NodeFeatures(
             info.bounds,
             self.velocity,
@@ -345,7 +334,6 @@ class GraphNetwork(Baseline):
             outputs=self.info.box.dimension,
             latent=self.options.latent,
             layers=self.options.layers,
-            sum_messages=self.options.sum_messages,
         )
         last_layer = network.decoder[-1]
         for parameter in last_layer.parameters():
@@ -420,7 +408,7 @@ class GraphNetwork(Baseline):
     @property
     def future(self) -> int:
         """Frames to predict in training, with gradients and without."""
-        return self.options.rollout_loss_steps + self.options.pushforward
+        return 1 + self.options.pushforward
 
     @property
     def weights(self) -> Mapping[str, float]:
@@ -436,104 +424,61 @@ class GraphNetwork(Baseline):
     ) -> dict[str, Tensor]:
         """Return the terms of the loss (Eq. 5.35) and the operator's own, unweighted.
 
-        They are means over the steps whose error counts. In three dimensions, and with
-        periodic axes, only the terms of particles exist.
+        In three dimensions, and with periodic axes, only the terms of particles exist.
+        With ``recovery`` the target is the true velocity plus the velocity that leads
+        back to the true path.
 
         Args:
             batch: windows of frames.
-            generator: draws noise, and the number of steps before those that count;
+            generator: draws noise, and the number of steps before the one that counts;
                 None for a validation, which has neither.
         """
+        options = self.options
         if generator is not None:
-            batch = augment(
-                self, batch, generator, noise_spread=self.options.noise_spread
-            )
-            if self.options.noise_std > 0.0:
+            batch = augment(self, batch, generator, noise_spread=options.noise_spread)
+            if options.noise_std > 0.0:
                 position = self.box.inside(batch.position)
                 batch = replace(batch, position=position)
-        given = batch.part(slice(self.history))
-        state = self.start(given)
-        first_frame = self.history  # the first frame whose error counts
-        if generator is not None and self.options.pushforward:
-            state, frame_count = self._push_forward(state, generator)
-            first_frame += frame_count
-
-        step_terms = []
-        end_frame = first_frame + self.options.rollout_loss_steps
-        for frame in range(first_frame, end_frame):
-            following, operator_losses = self.step(state, generator)
-            terms = self._step_terms(state, following, batch, frame)
-            terms.update(operator_losses)
-            step_terms.append(terms)
-            state = following
-
-        means = {}
-        for name in step_terms[0]:
-            values = [terms[name] for terms in step_terms]
-            of_steps = torch.stack(values)
-            means[name] = of_steps.mean()
-        return means
-
-    @torch.no_grad()
-    def _push_forward(
-        self, state: ParticleState, generator: torch.Generator
-    ) -> tuple[ParticleState, int]:
-        """Return the state after a random number of own steps, and their number."""
-        device = generator.device
-        end = self.options.pushforward + 1
-        drawn = torch.randint(end, (), generator=generator, device=device)
-        frame_count = int(drawn)
-        # Operators have losses of their own in training only; nobody needs them here.
-        was_training = self.training
-        self.eval()
-        try:
-            for _ in range(frame_count):
-                state, _ = self.advance(state)
-        finally:
+        state = self.start(batch.part(slice(self.history)))
+        frame = self.history  # the frame whose error counts
+        if generator is not None and options.pushforward:
+            end = options.pushforward + 1
+            drawn = torch.randint(end, (), generator=generator, device=generator.device)
+            # Operators have losses of their own in training only; nobody needs them
+            # here.
+            was_training = self.training
+            self.eval()
+            with torch.no_grad():
+                for _ in range(int(drawn)):
+                    state, _ = self.advance(state)
             self.train(was_training)
-        return state, frame_count
+            frame += int(drawn)
+        following, operator_losses = self.step(state, generator)
 
-    def _step_terms(
-        self, state: ParticleState, following: ParticleState, batch: Batch, frame: int
-    ) -> dict[str, Tensor]:
-        """Return the terms of one step to a frame of the batch.
-
-        With ``recovery`` the target is the true velocity plus the velocity that leads
-        back to the true path.
-        """
         target_position = batch.position[:, frame]
         true_position = batch.position[:, frame - 1]
         target_velocity = self.box.displacement(true_position, target_position)
-        if self.options.recovery is not None:
+        if options.recovery is not None:
             gap = self.box.displacement(state.position.detach(), true_position)
             way_back = velocity_towards_path(
-                gap,
-                self.options.recovery,
-                acceleration_std=self.acceleration_std,
+                gap, options.recovery, acceleration_std=self.acceleration_std
             )
             target_velocity = target_velocity + way_back
-
         # Both accelerations start from the state's velocity.
         last_velocity = state.velocity[:, -1]
         target_acceleration = target_velocity - last_velocity
         target = Motion(target_position, target_velocity, target_acceleration)
-        predicted_velocity = following.velocity[:, -1]
-        predicted_acceleration = predicted_velocity - last_velocity
-        predicted = Motion(
-            following.position, predicted_velocity, predicted_acceleration
-        )
+        velocity = following.velocity[:, -1]
+        predicted = Motion(following.position, velocity, velocity - last_velocity)
         scales = {
             "acceleration": self.acceleration.std,
             "velocity": self.velocity.std,
             "position": self.position.std,
         }
-        return loss_terms(
-            predicted,
-            target,
-            state.sample,
-            grid=self.grid,
-            scales=scales,
+        terms = loss_terms(
+            predicted, target, state.sample, grid=self.grid, scales=scales
         )
+        return {**terms, **operator_losses}
 
     def start(self, given: Batch) -> ParticleState:
         """Return the state after the given frames.
@@ -587,11 +532,7 @@ class GraphNetwork(Baseline):
         edge_index = self.find_edges(state)
         output, losses = self.predict(state, edge_index, generator)
         last_velocity = state.velocity[:, -1]
-        if self.options.target is GraphTarget.VELOCITY:
-            velocity = self.velocity.inverse(output)
-        else:
-            acceleration = self.acceleration.inverse(output)
-            velocity = last_velocity + acceleration
+        velocity = last_velocity + self.acceleration.inverse(output)
         if self.free_flight is not None:
             acceleration = self.free_flight(
                 velocity - last_velocity, state.position, last_velocity, state.sample

@@ -160,9 +160,6 @@ def train(
     """
     entry = find(baseline)
     tier, root_folder, known_splits = locate(split, size, root=root, registry=registry)
-    entry.model.check_data_set(
-        tier.split, tier.name, tier.box, is_full_box=tier.is_full_box
-    )
     initial = None
     if start is not None:
         initial = start_from(

@@ -29,10 +29,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
+from typing import ClassVar
 
 PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
 """Entry points by which other packages add models, splits and metrics."""
@@ -296,11 +293,6 @@ def describe_exception(error: BaseException, *modules: str) -> str:
     if place is None:
         return description
     return f"{description} ({place})"
-
-
-def load_entry_point(point: EntryPoint) -> Any:  # noqa: ANN401 (any object)
-    """Import the object that an entry point of another package names."""
-    return point.load()
 
 
 def require(module: str, *, extra: str) -> ModuleType:

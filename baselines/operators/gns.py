@@ -14,9 +14,7 @@ class GNS(Operator):
     .. math:: a_i = \sum_j m_{ij}
 
     With the network's node MLP:
-    :math:`x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])`. The option
-    ``sum_messages: false``, which changes other operators' node inputs, changes nothing
-    here.
+    :math:`x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])`.
     """
 
     method = "GNS"

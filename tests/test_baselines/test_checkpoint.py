@@ -187,7 +187,7 @@ SMALL_MODELS: dict[str, dict[str, Any]] = {
     "lstm-mlp": {"latent": 4, "decoder": [4]},
     "var": {"lags": 1},
     "var-stable": {"rank": 2},
-    "hybrid-projection": {"resolution": 1.0},
+    "hybrid-projection": {},
     "hybrid-coarse": {},
 }
 """Options of small models; all others are graph networks."""

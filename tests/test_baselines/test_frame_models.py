@@ -310,10 +310,3 @@ def test_the_density_term_compares_maps() -> None:
     density = float(terms["density"].detach())
     assert density == pytest.approx(expected, rel=1e-4)
     assert model.weights == {"density": 0.03}
-
-
-GATED_FOR_TRAINING: dict[str, Any] = {
-    "latent": 32,
-    "decoder": [32],
-    "dropout": [0.0, 0.0],
-}

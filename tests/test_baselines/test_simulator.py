@@ -23,8 +23,6 @@ from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import mirror_batch
 
-TARGETS = pytest.mark.parametrize("target", ["acceleration", "velocity"])
-
 
 def seeded(seed: int = 0) -> torch.Generator:
     """Return a seeded source of randomness."""
@@ -42,16 +40,15 @@ def rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.round(values * 2**16) / 2**16
 
 
-@TARGETS
-def test_an_oracle_makes_no_error_over_a_rollout(target: str) -> None:
-    """With the true accelerations or velocities, 90 frames end at the truth.
+def test_an_oracle_makes_no_error_over_a_rollout() -> None:
+    """With the true accelerations 90 frames end at the truth.
 
     They differ by the rounding of float32 only.
     """
     frames = swirl(0, 96)
     truth = batch(frames)
     exact = torch.from_numpy(frames).transpose(0, 1)
-    model = oracle(exact, target)
+    model = oracle(exact)
     path = roll_out(model, frames[:6], 90)
 
     first = truth.position[:, 5]
@@ -60,11 +57,8 @@ def test_an_oracle_makes_no_error_over_a_rollout(target: str) -> None:
     assert float(distance.max()) > 0.2
     # The initial velocities are differences of float32 positions: 6e-8 a frame, which
     # accelerations do not mend.
-    tolerance = 1e-6
-    if target == "acceleration":
-        tolerance = 90 * 6e-8
     error = greatest_difference(path, truth.position[:, 6:])
-    assert error < tolerance
+    assert error < 90 * 6e-8
 
 
 def test_untrained_models_of_accelerations_keep_velocities() -> None:
@@ -77,8 +71,7 @@ def test_untrained_models_of_accelerations_keep_velocities() -> None:
     assert_close(path, straight, rtol=0.0, atol=3e-7)
 
 
-@TARGETS
-def test_a_shift_away_from_walls_shifts_the_rollout(target: str) -> None:
+def test_a_shift_away_from_walls_shifts_the_rollout() -> None:
     """One vector moves all particles, and so the rollout; it is exact in binary."""
     rng = np.random.default_rng(0)
     start = rounded(jittered(0, 8, 0.3, 0.5))
@@ -87,7 +80,7 @@ def test_a_shift_away_from_walls_shifts_the_rollout(target: str) -> None:
     frames = start + steps.cumsum(axis=0)
     shift = np.array([0.25, 0.125])
 
-    model = network(awake=True, target=target)
+    model = network(awake=True)
     window = batch(frames)
     path = rolled(model, window, 4)
     shifted_path = roll_out(model, frames + shift, 4)
@@ -103,11 +96,7 @@ def mirror_model(model: Any, axis: int) -> Any:
     Every input that changes sign has its column negated, the two walls across have
     their columns swapped, and the output along the axis is negated.
     """
-    mirrored = network(
-        awake=True,
-        target=model.options.target.value,
-        wall_velocity=True,
-    )
+    mirrored = network(awake=True, wall_velocity=True)
     mirrored.load_state_dict(model.state_dict())
     low = 2 * axis
     high = 2 * axis + 1
@@ -137,8 +126,7 @@ def mirror_model(model: Any, axis: int) -> Any:
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-@TARGETS
-def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
+def test_a_mirrored_model_in_a_mirrored_world(axis: int) -> None:
     """Walls, their motion and the weights mirrored: the rollout is the mirror image."""
     rng = np.random.default_rng(0)
     windows = []
@@ -152,7 +140,7 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     matrix[:, axis, axis] = -1.0
     image = mirror_batch(window, matrix, info().bounds)
 
-    model = network(awake=True, target=target, wall_velocity=True)
+    model = network(awake=True, wall_velocity=True)
     expected = rolled(model, window, 3)
     expected[..., axis] = 1.0 - expected[..., axis]
     mirrored = mirror_model(model, axis)

@@ -44,7 +44,6 @@ def info(generated: GenerationResult, unmeasured: Registry) -> DatasetInfo:
         ("mlp", {"target": "change"}),
         ("lstm", {}),
         ("gns", {"latent": 4, "layers": 1, "noise_std": 0.0, "recovery": 8.0}),
-        ("gns", {"latent": 4, "layers": 1, "noise_std": 0.0, "target": "velocity"}),
         ("neuralmpm", {"width": 4, "recovery": 8.0}),
     ],
 )

@@ -182,7 +182,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     ("baseline", "settings", "steps"),
     [
         ("drift", ["steps=3"], 3),
-        ("var", [], 1),  # to fit a closed form counts as one step
+        ("fitted", [], 1),  # a fit counts as one step
     ],
 )
 def test_a_finished_training_is_not_repeated(
@@ -236,7 +236,7 @@ def test_training_draws_nothing_from_the_callers_generators(run: Run) -> None:
     "command",
     [
         ("drift", "steps=2"),
-        ("var",),
+        ("fitted",),
     ],
 )
 def test_a_changed_value_of_train_stops_the_training(
