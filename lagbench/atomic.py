@@ -7,7 +7,7 @@ import os
 import secrets
 import shlex
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -72,21 +72,6 @@ def checked_path(target: Path, *, option: str) -> Iterator[Path]:
         unchecked = Path(folder) / target.name
         yield unchecked
         write_atomically(target, unchecked.read_bytes(), option=option)
-
-
-def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
-    """Rename files to places on the same disk, in their order.
-
-    Files are flushed and folders made before the first file is moved. If a move fails,
-    the moves before it stay.
-    """
-    for source, target in moves:
-        _flush(source)
-        target.parent.mkdir(parents=True, exist_ok=True)
-    for source, target in moves:
-        source.replace(target)
-    for folder in {target.parent for _, target in moves}:
-        _flush(folder)
 
 
 def check_output_file(

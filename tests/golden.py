@@ -8,15 +8,17 @@ Record them anew, with a commit that says why they changed:
 from __future__ import annotations
 
 import argparse
+import functools
 import hashlib
+import io
 import json
 import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,13 +39,15 @@ Json = Any
 
 def run_lagbench(*words: object, root: Path) -> Json:
     """Run a command with --json; return what it prints."""
-    finished = subprocess.run(
-        [sys.executable, "-m", "lagbench", *map(str, words), "--json"],
-        env={**os.environ, "LAGBENCH_ROOT": str(root), "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        check=False,
-    )
-    return json.loads(finished.stdout)
+    from lagbench.cli.program import app
+
+    environment = {"LAGBENCH_ROOT": str(root), "OMP_NUM_THREADS": "1"}
+    with (
+        mock.patch.dict(os.environ, environment),
+        redirect_stdout(io.StringIO()) as stdout,
+    ):
+        app([*map(str, words), "--json"])
+    return json.loads(stdout.getvalue())
 
 
 def without_volatile(value: Json) -> Json:
@@ -71,6 +75,7 @@ def dataset_hash(split: str, root: Path) -> str:
     return lagbench.generate(split, "tiny", root=root, workers=1).dataset_sha256
 
 
+@functools.cache
 def _true_positions(split: str, root: Path) -> dict[int, Floats]:
     """Return the positions [frame, particle, space] of each test scenario of tiny."""
     import lagbench
@@ -110,10 +115,11 @@ PREDICTIONS = {
 def write_prediction(name: str, root: Path, folder: Path) -> Path:
     """Write a predictions.nc of tiny data; it follows from the data alone."""
     import lagbench
+    from lagbench.data.registry import load
 
     split, predict = PREDICTIONS[name]
-    task = run_lagbench("info", split, root=root)["sizes"]["tiny"]["task"]
-    given, horizon = task["input_frames"], task["horizon"]
+    task = load().size(split, "tiny").task
+    given, horizon = task.input_frames, task.horizon
     positions = {}
     for scenario, truth in _true_positions(split, root).items():
         positions[scenario] = predict(truth[: given + horizon], given)

@@ -17,7 +17,7 @@ from lagbench.errors import LagbenchError, UsageError, check_installed, suggest_
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
-from lagbench.models.onnx_model import open_onnx
+from lagbench.models.onnx_model import OnnxModel
 from lagbench.scoring.task import SUBMISSION, ScoredTask, measure_rows
 from lagbench.work.run import Meter, Progress
 
@@ -170,7 +170,7 @@ class ModelRuns:
             raise UsageError(f"{name_seed(entry, prediction)} has no model")
         path = find_model(self.folder, prediction.weights)
         if path.suffix == ".onnx":
-            return open_onnx(path, size=self.size(entry), root=self.root)
+            return OnnxModel(path, size=self.size(entry), root=self.root)
 
         check_installed("torch", extra="baselines")
         from lagbench.baselines.runner import WeightsRunner

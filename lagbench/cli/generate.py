@@ -9,7 +9,6 @@ from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import locate_new
 from lagbench.errors import format_count, hide_credentials
 from lagbench.make.generate import GenerationResult, generate
-from lagbench.make.inventory import recording_hint
 
 from .options import (
     DrawSeedOption,
@@ -84,8 +83,6 @@ def generate_command(
         lines = _describe_plan(result)
     else:
         lines = _describe_result(result)
-        if result.complete and draw_seed is None:
-            lines += recording_hint(result.split, result.size, result.root)
     print_result(result, lines, as_json=as_json, quiet=quiet)
 
 

@@ -58,26 +58,6 @@ LEGEND = (
 def list_command(*, root: RootOption = None, as_json: JsonFlag = False) -> None:
     """List all splits and sizes, their cost, and the data on this machine."""
     folder = resolve_root(root)
-    overviews = _list_overviews(folder)
-    if as_json:
-        print_json({"root": folder, "sizes": overviews})
-        return
-    print_table("", COLUMNS, map(_format_row, overviews))
-    for line in LEGEND:
-        print_line(line)
-    print_line(
-        f"folder of all data sets: {hide_credentials(url_of(folder) or str(folder))}"
-    )
-
-
-def _list_overviews(folder: Path) -> list[Overview]:
-    """Return the overview of every size, those of local splits last.
-
-    A local split whose description cannot be read is left out with a warning.
-
-    Raises:
-        ClosedFolderError: the root folder may not be read.
-    """
     refuse_closed_folder(folder / STORE_FILE)
     registry = load_rooted_registry(folder, load())
     overviews: list[Overview] = []
@@ -88,7 +68,15 @@ def _list_overviews(folder: Path) -> list[Overview]:
             overviews += _overviews_of_split(registry, name, folder)
         except (LagbenchError, OSError) as error:
             print_warning(f"{name} is left out: {error}")
-    return overviews
+    if as_json:
+        print_json({"root": folder, "sizes": overviews})
+        return
+    print_table("", COLUMNS, map(_format_row, overviews))
+    for line in LEGEND:
+        print_line(line)
+    print_line(
+        f"folder of all data sets: {hide_credentials(url_of(folder) or str(folder))}"
+    )
 
 
 def _overviews_of_split(registry: Registry, split: str, folder: Path) -> list[Overview]:

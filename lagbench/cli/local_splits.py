@@ -70,7 +70,7 @@ def import_command(
         "frame_interval": frame_interval,
         "spacing": spacing,
         "bounds": _parse_bounds(bounds),
-        "periodic": None if periodic is None else _parse_axes(periodic),
+        "periodic": () if periodic == "none" else periodic and periodic.split(","),
         "rescale": rescale,
         "input_frames": input_frames,
         "horizon": horizon,
@@ -105,13 +105,6 @@ def _parse_bounds(text: str | None) -> list[list[float]] | None:
             "--bounds 0,2,0,1"
         ) from None
     return [ends[start : start + 2] for start in range(0, len(ends), 2)]
-
-
-def _parse_axes(text: str) -> tuple[str, ...]:
-    """Return the names of axes; "none" stands for no axis."""
-    if text == "none":
-        return ()
-    return tuple(text.split(","))
 
 
 def _next_steps(local_split: LocalSplit) -> Iterator[str]:

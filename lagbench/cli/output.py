@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -241,19 +240,14 @@ def _print_lines(unit: str, seconds_per_line: float) -> Listener:
         rate = _format_rate(progress, unit)
         if rate:
             parts.append(rate)
-        seconds_left = _seconds_left(progress)
-        if math.isfinite(seconds_left):
+        if progress.scenarios and progress.rate:
+            seconds_left = (
+                progress.scenarios - progress.scenarios_done
+            ) / progress.rate
             parts.append(f"{format_seconds(seconds_left)} left")
         print_on_stderr(f"{progress.stage}: {', '.join(parts)}")
 
     return print_progress
-
-
-def _seconds_left(progress: Progress) -> float:
-    """Return the time that the rest takes [s]; infinity where it cannot be known."""
-    if not progress.scenarios or not progress.rate:
-        return math.inf
-    return (progress.scenarios - progress.scenarios_done) / progress.rate
 
 
 def _format_rate(progress: Progress, unit: str) -> str:

@@ -70,8 +70,8 @@ def predict_command(
         bench: Time our solver too, for the speed-up.
     """
     clock = time_solver if bench else None
+    check_regular(checkpoint)
     if checkpoint.suffix == ".onnx":
-        check_regular(checkpoint)
         has_other_device = device not in ("auto", "cpu") or threads not in (None, 1)
         if settings or batch is not None or has_other_device:
             raise UsageError(

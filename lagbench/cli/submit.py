@@ -70,10 +70,10 @@ def submit_command(
 
 def _describe(result: SubmitResult) -> Iterator[str]:
     is_default_board = result.board == DEFAULT_BOARD
-    yield (
-        f"{result.method} on {result.split} {result.size}: {result.ranking} "
-        f"{_format_mean(result)}"
-    )
+    mean = "undefined" if result.mean is None else f"{result.mean:.4g}"
+    if result.std is not None:
+        mean += f" ± {result.std:.2g} over seeds"
+    yield f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}"
     for flag in result.flags:
         yield f"flag {flag}: raised"
     if result.size == "tiny" and is_default_board:
@@ -107,12 +107,3 @@ def _describe(result: SubmitResult) -> Iterator[str]:
         f"next: lagbench leaderboard check{board_option}; "
         f"to see the page: lagbench leaderboard build{board_option}"
     )
-
-
-def _format_mean(result: SubmitResult) -> str:
-    if result.mean is None:
-        return "undefined"
-    mean = f"{result.mean:.4g}"
-    if result.std is None:
-        return mean
-    return f"{mean} ± {result.std:.2g} over seeds"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from cyclopts.types import NonNegativeInt
 
-from lagbench.make.inventory import recording_hint
 from lagbench.make.verify import VerificationResult, verify
 
 from .options import (
@@ -82,7 +81,3 @@ def _print_verification(result: VerificationResult) -> None:
             outcomes.append(f"scenario {scenario} {outcome}")
         print_line(f"regenerated: {', '.join(outcomes)}")
     print_line(f"data set hash: {result.verdict}")
-    if result.dataset_sha256 is not None:
-        root = result.folder.parents[2]  # above split, size and version
-        for line in recording_hint(result.split, result.size, root):
-            print_line(line)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -101,8 +101,7 @@ class GenerationResult:
     device: str  # where the solver ran
     workers: int  # worker processes
     simulated: tuple[int, ...]  # ids that were (dry run: would be) simulated
-    # ids whose files were there and right (dry run: or would be gathered)
-    kept: tuple[int, ...]
+    kept: tuple[int, ...]  # ids whose files were there and right
     missing: tuple[int, ...]  # ids of the size that are still not there
     bytes_needed: int  # disk space of 'simulated' before compression [bytes]
     bytes_free: int  # free disk space before the start [bytes]
@@ -125,7 +124,6 @@ def generate(
     device: str = "cpu",
     scheduler: str | None = None,
     gather: Sequence[str | Path] = (),
-    force: bool = False,
     dry_run: bool = False,
     progress: Callable[[Progress], None] | None = None,
     on_wait: Callable[[str], None] | None = None,
@@ -147,8 +145,8 @@ def generate(
             "cuda" gives others.
         scheduler: address of a Dask scheduler whose workers simulate instead; they must
             see the root folder under the same path.
-        gather: other root folders, from which finished scenarios are taken first.
-        force: simulate scenarios again even if their files are there and correct.
+        gather: other root folders, from which finished scenarios are taken first; not
+            in a dry run.
         dry_run: only say what it would take.
         progress: called as the work advances.
         on_wait: called with the holder in words when another process holds the lock.
@@ -191,17 +189,10 @@ def generate(
         meter=Meter(progress),
         store=None,
     )
-    sources = [expand_path(source, "--gather") for source in gather]
-
     if dry_run:
         if url is not None:
             campaign.store = Publication(tier, data_root, url)
-        joint = campaign.manifest
-        for source in sources:
-            joint = gather_files(tier, data_root, source, joint, dry_run=True)
-        old = campaign.manifest
-        gathered = {e.scenario for e in joint.files if old.entry(e.scenario) is None}
-        scan = _scan_folder(campaign, wanted_ids, force=force, gathered=gathered)
+        scan = _scan_folder(campaign, wanted_ids)
         manifest = scan.manifest
         verdict = ""
     else:
@@ -216,10 +207,10 @@ def generate(
             if store is not None:
                 campaign.manifest = store.join(campaign.manifest)
             remove_leftovers(campaign.folder)
-            for source in sources:
-                joint = gather_files(tier, data_root, source, campaign.manifest)
-                campaign.keep(joint)
-            scan = _scan_folder(campaign, wanted_ids, force=force)
+            for source in gather:
+                folder = expand_path(source, "--gather")
+                campaign.keep(gather_files(tier, data_root, folder, campaign.manifest))
+            scan = _scan_folder(campaign, wanted_ids)
             record_entry_hashes(campaign.folder, scan.hashed)
             check_disk(data_root, scan.to_do.bytes)
             campaign.keep(scan.manifest)
@@ -233,7 +224,10 @@ def generate(
             verdict = compare_hashes(tier, manifest, promised=campaign.promised)
             # Scenarios of a blind test have no card: it would say how to make the
             # public ones.
-            if tier.draw_seed is None and not _is_settled(campaign, scan):
+            has_all = (
+                store is not None and not scan.to_do.scenarios and store.has_card()
+            )
+            if tier.draw_seed is None and not has_all:
                 campaign.meter.begin("cards", total=1, scenarios=len(manifest.files))
                 campaign.fetch(tier.scenarios)
                 cards = write_cards(data_root, tier, campaign.split, manifest)
@@ -257,7 +251,7 @@ def generate(
         missing=tuple(missing_ids),
         bytes_needed=scan.to_do.bytes,
         bytes_free=bytes_free,
-        seconds_expected=scan.to_do.seconds(cores),
+        seconds_expected=scan.to_do.core_seconds / cores,
         seconds=time.monotonic() - started,
         complete=manifest.complete,
         dataset_sha256=manifest.dataset_sha256,
@@ -332,17 +326,10 @@ class _Scan:
     to_do: Estimate  # chosen ids to simulate, and what that takes
 
 
-def _scan_folder(
-    campaign: _Campaign,
-    wanted_ids: Sequence[int],
-    *,
-    force: bool,
-    gathered: Collection[int] | None = None,
-) -> _Scan:
+def _scan_folder(campaign: _Campaign, wanted_ids: Sequence[int]) -> _Scan:
     """Find the files that are right, and which wanted ids must be simulated.
 
-    Nothing is written. ``gathered`` is given in a dry run: the ids that gathering would
-    bring. They count as right, and hashes of the manifest are trusted.
+    Nothing is written.
     """
     size = campaign.size
     old = campaign.manifest
@@ -368,7 +355,6 @@ def _scan_folder(
             scenario,
             manifest=old.only(scenario),
             quick=True,
-            trusting=gathered is not None,
         )
     paths = map(campaign.path, inspected_ids)
     results = campaign.read_files(run_inspection, inspections, paths)
@@ -382,18 +368,11 @@ def _scan_folder(
     good_entries = [entry for entry in old.files if entry.scenario not in bad_ids]
     base = old.model_copy(update={"files": tuple(good_entries)})
 
-    kept_ids = []
-    missing_ids = []
-    for scenario in wanted_ids:
-        is_there = scenario not in bad_ids or scenario in (gathered or ())
-        if is_there and not force:
-            kept_ids.append(scenario)
-        else:
-            missing_ids.append(scenario)
+    missing_ids = [scenario for scenario in wanted_ids if scenario in bad_ids]
     return _Scan(
         manifest=merge_entries(size, base, [*hashed, *stored.values()]),
         hashed=tuple(hashed),
-        kept=tuple(kept_ids),
+        kept=tuple(scenario for scenario in wanted_ids if scenario not in bad_ids),
         to_do=estimate(size, missing_ids),
     )
 
@@ -544,9 +523,3 @@ def _complete_statistics(campaign: _Campaign) -> None:
         moments = campaign.read_files(read_moments, paths, paths.values())
         manifest = manifest.model_copy(update={"statistics": statistics(moments)})
     campaign.keep(manifest)
-
-
-def _is_settled(campaign: _Campaign, scan: _Scan) -> bool:
-    """Return whether a store has all that there is, its cards too."""
-    store = campaign.store
-    return store is not None and not scan.to_do.scenarios and store.has_card()

@@ -10,7 +10,6 @@ that promises no equal bits may differ from datasets.yaml, but not from its mani
 from __future__ import annotations
 
 import enum
-import shlex
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,12 +21,10 @@ from lagbench.data.layout import (
     PICTURES,
     format_ids,
     has_file,
-    quote_root,
     refuse_closed_folder,
     scenario_path,
     url_of,
 )
-from lagbench.data.local import locate
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
@@ -109,7 +106,7 @@ def overview(size: Size, root: Path) -> Overview:
 
     seconds = 0.0
     if size.simulated:
-        seconds = estimate(size, ids).seconds(available_cores())
+        seconds = estimate(size, ids).core_seconds / available_cores()
     url = url_of(root)
     if url is None:
         present_ids = {i for i in ids if has_file(size.path(root, i))}
@@ -170,7 +167,6 @@ def inspect_scenario(
     *,
     manifest: Manifest | None = None,
     quick: bool = False,
-    trusting: bool = False,
 ) -> ScenarioInspection:
     """Inspect a scenario's file.
 
@@ -181,8 +177,6 @@ def inspect_scenario(
         manifest: what the folder's manifest says.
         quick: ask for a manifest entry, and take the content hash that this machine
             noted before instead of hashing the values again.
-        trusting: take the manifest's content hash too, where the bytes are those of
-            the manifest.
 
     Raises:
         ClosedFolderError: the folder of the file may not be read.
@@ -192,9 +186,7 @@ def inspect_scenario(
     if not path.exists():
         return ScenarioInspection(scenario=scenario, state=DataSetState.MISSING)
     try:
-        return _inspect_file(
-            root, size, scenario, manifest=manifest, quick=quick, trusting=trusting
-        )
+        return _inspect_file(root, size, scenario, manifest=manifest, quick=quick)
     except DataError as error:
         problem = str(error)
     except OSError as error:
@@ -211,7 +203,6 @@ def _inspect_file(
     *,
     manifest: Manifest | None,
     quick: bool,
-    trusting: bool,
 ) -> ScenarioInspection:
     """Inspect a file that is there; one that is not right is a DataError."""
     path = size.path(root, scenario)
@@ -228,8 +219,6 @@ def _inspect_file(
         else:
             # Before the values: a file that changes meanwhile then fits no note.
             digest = file_sha256(path)
-    if trusting and claim is not None and digest == claim.file_sha256:
-        noted_content = claim.content_sha256
 
     with read_scenario(path) as file:
         key = file.header.key
@@ -400,23 +389,6 @@ def compare_hashes(
     if manifest.complete:
         return f"equal to {record}"
     return f"what is there is equal to {record}"
-
-
-def recording_hint(split: str, size_name: str, root: Path) -> list[str]:
-    """Return how the author of a split records the hashes of a complete data set.
-
-    There are no lines where they are recorded, or the data lie in a store.
-    """
-    size, _, _ = locate(split, size_name, root=root)
-    if size.measured is not None or url_of(root) is not None:
-        return []
-    options = f"--split {size.split} --size {size.name} --root {quote_root(root)}"
-    registry = shlex.quote(str(size.file))
-    return [
-        "Is the split yours? Then record the hashes of these data. Later generations, "
-        "on other machines too, are compared with them:",
-        f"  python -m lagbench.generators.record {options} --registry {registry}",
-    ]
 
 
 def _hash_error(size: Size, what: str, place: str) -> DataError:

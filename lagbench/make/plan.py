@@ -24,12 +24,6 @@ from lagbench.generators.constants import solver_constants
 PARTICLE_SUBSTEP_SECONDS = {2: 45e-9, 3: 95e-9}
 """Time of one particle's substep by dimension [s]."""
 
-FRAME_SECONDS = 2.3e-3
-"""Time to read out, check and write a frame [s]."""
-
-START_SECONDS = 8.0
-"""Time in which a worker starts and compiles the solver [s]."""
-
 Selection = str | Sequence[str] | None
 Scenarios = str | Iterable[int] | None
 
@@ -85,20 +79,9 @@ class Estimate:
 
     scenarios: tuple[int, ...]  # their ids, ascending
     substeps: tuple[int, ...]  # substeps of each, in the same order
-    frames: int  # frames that they record together
     # disk space, before compression [bytes]; files come out a little smaller
     bytes: int
-    # time on one core, perturbed runs of test scenarios included [s], for orientation
-    core_seconds: float
-
-    def seconds(self, workers: int) -> float:
-        """Return the time with some workers [s]: all start, then share evenly, never
-        below the longest.
-        """
-        if not self.substeps:
-            return 0.0
-        longest = self.core_seconds * max(self.substeps) / sum(self.substeps)
-        return START_SECONDS + max(self.core_seconds / workers, longest)
+    core_seconds: float  # time of the solver on one core [s], for orientation
 
 
 def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
@@ -117,27 +100,13 @@ def estimate(size: Size, scenarios: Sequence[int]) -> Estimate:
     solver_constants(size)  # refuses parameters that the solver cannot use
 
     substeps = tuple(substep_count(size, scenario) for scenario in scenarios)
-    frames = sum(map(size.frame_count, scenarios))
-
-    # Test scenarios are simulated a second time, perturbed, up to the horizon.
-    total_substeps = sum(substeps)
-    total_frames = frames
-    for scenario, count in zip(scenarios, substeps, strict=True):
-        if size.subset_of(scenario) == "test":
-            omitted_frames = size.frames_after_horizon(scenario)
-            omitted_substeps = omitted_frames * size.substeps_per_frame
-            total_substeps += count - omitted_substeps * size.refinement
-            total_frames += size.frame_count(scenario) - omitted_frames
-
     particles = size.particles * size.refinement**size.dimension
     substep_seconds = PARTICLE_SUBSTEP_SECONDS[size.dimension]
-    solver_seconds = total_substeps * particles * substep_seconds
     return Estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
-        frames=frames,
         bytes=size.data_set_bytes(scenarios),
-        core_seconds=solver_seconds + total_frames * FRAME_SECONDS,
+        core_seconds=sum(substeps) * particles * substep_seconds,
     )
 
 

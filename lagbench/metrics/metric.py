@@ -159,9 +159,8 @@ class Metric:
     statistic is NaN, the frame is undefined: left out of the mean and counted.
 
     Raises:
-        UsageError: both ``statistic`` and ``of`` are missing; ``of`` is no tuple; a
-            target has no ``perfect`` value; the name does not consist of small letters,
-            digits and underscores; or there is no direction.
+        UsageError: both ``statistic`` and ``of`` are missing, or a name does not
+            consist of small letters, digits and underscores.
     """
 
     name: str  # unique
@@ -197,30 +196,17 @@ class Metric:
         """Fill in ``of``; refuse a metric that is incomplete or has no usable name."""
         names = tuple(self.of) or (self.name,)
         for name in (self.name, *names):
-            is_text = isinstance(name, str)
-            if not is_text or not NAME.fullmatch(name) or name in RESERVED:
+            if not NAME.fullmatch(name) or name in RESERVED:
                 raise UsageError(
                     f"{name!r:.80} names no metric; take up to 64 small letters, "
                     "digits and underscores, as in my_error, not skill"
                 )
-        where = f"metric {self.name!r}"
-        if self.direction not in set(Direction):
-            raise UsageError(
-                f"no direction {self.direction!r}; name one of {', '.join(Direction)}",
-                where=where,
-            )
-        of: object = self.of  # a package may write a text
-        if isinstance(of, str):
-            raise UsageError(f"of is a text; write of=({self.of!r},)", where=where)
         if self.statistic is None and not self.of:
             raise UsageError(
                 "no statistic; decorate its function, or name others by of=",
-                where=where,
+                where=f"metric {self.name!r}",
             )
-        direction = Direction(self.direction)
-        if self.perfect is None and direction is Direction.TARGET:
-            raise UsageError("a target needs perfect=, as perfect=1.0", where=where)
-        object.__setattr__(self, "direction", direction)
+        object.__setattr__(self, "direction", Direction(self.direction))
         object.__setattr__(self, "of", names)
 
     def measure(self, pair: FramePair) -> float:

@@ -9,7 +9,6 @@ the methods.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -174,18 +173,15 @@ Seeds = Score | Sequence[Score]
 """Score of one seed, or of each seed of a method."""
 
 
-def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
+def compare(first: Seeds, second: Seeds) -> Comparison:
     """Compare two methods in one metric over the scenarios that both have.
 
     Args:
         first: scores of a method's seeds.
         second: scores of another method's seeds.
-        paired: whether seed s of both is one training, used in two ways: its scatter
-            then cancels, and the differences seed by seed are tested.
 
     Raises:
-        UsageError: the scores are of different metrics, or two paired methods have
-            different numbers of seeds.
+        UsageError: the scores are of different metrics.
     """
     first_scores = _as_sequence(first)
     second_scores = _as_sequence(second)
@@ -201,22 +197,10 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
 
     a = _table(first_losses, common)
     b = _table(second_losses, common)
-    is_row_by_row = len(a) == len(b) and (paired or len(a) == 1)
-    if is_row_by_row:
+    if len(a) == len(b) == 1:
         # Sums in another order differ in their last digits: no method is better by it.
         is_equal = np.isclose(a, b, rtol=ROUNDING, atol=0.0)
         b = np.where(is_equal, a, b)
-    seeds = (len(a), len(b))
-    if paired:
-        if len(a) != len(b):
-            raise UsageError(f"{len(a)} and {len(b)} seeds; pairs need as many")
-        a = a - b
-        # a scenario that no seed has in both methods compares nothing
-        is_defined = np.asarray(~np.isnan(a).all(axis=0))
-        a = a[:, is_defined]
-        common = tuple(itertools.compress(common, is_defined))
-        b = np.zeros((1, len(common)))
-
     interval = (math.nan, math.nan)
     p = math.nan
     if common:
@@ -230,7 +214,7 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
         difference=mean(mean_over_seeds(a) - mean_over_seeds(b)),
         interval=interval,
         p=p,
-        seeds=seeds,
+        seeds=(len(a), len(b)),
     )
 
 

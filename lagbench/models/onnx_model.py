@@ -272,11 +272,6 @@ class OnnxModel:
         return np.asarray(output, np.float64)
 
 
-def open_onnx(path: Path, *, size: Size, root: Path) -> OnnxModel:
-    """Return the model of an ONNX file; see :class:`OnnxModel`."""
-    return OnnxModel(path, size=size, root=root)
-
-
 def find_edges(
     position: NDArray[np.float64],
     radius: float,

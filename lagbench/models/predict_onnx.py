@@ -18,7 +18,7 @@ from lagbench.submission.writer import (
 from lagbench.work.machine import processor_name
 from lagbench.work.run import Meter, Progress
 
-from .onnx_model import LEAST_SECONDS, check_onnx, open_onnx
+from .onnx_model import LEAST_SECONDS, OnnxModel, check_onnx
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +99,7 @@ def predict_onnx(
         )
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
-    runner = open_onnx(model_path, size=tier, root=folder)
+    runner = OnnxModel(model_path, size=tier, root=folder)
     meter = Meter(progress)
     meter.begin("predicting", total=len(paths), scenarios=len(paths))
     label = method or model_path.stem

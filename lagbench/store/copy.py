@@ -401,9 +401,7 @@ def publish(size: Size, root: Path, url: str) -> Iterator[Publication]:
 # --- other root folders ---------------------------------------------------------------
 
 
-def gather(
-    size: Size, root: Path, source: Path, manifest: Manifest, *, dry_run: bool = False
-) -> Manifest:
+def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest:
     """Take over finished scenarios of another root folder; return the joint manifest.
 
     Each job of an array generates some scenarios into a root folder of its own. The
@@ -415,7 +413,6 @@ def gather(
         root: root folder to take them to.
         source: the other root folder.
         manifest: manifest of the data set in the root folder.
-        dry_run: whether to return the manifest only, and take no file.
 
     Raises:
         UsageError: the source has no such data set, or is the root folder.
@@ -449,16 +446,15 @@ def gather(
             new_entries.append(entry)
         elif target.is_file() and file_sha256(target) == entry.file_sha256:
             taken_entries.append(entry)
-    if not dry_run:
-        for entry in new_entries:
-            check_scenario(source_folder / entry.path, entry.content_sha256)
-            with atomic_path(target_folder / entry.path) as temporary:
-                # Files are only ever replaced, so a shared one cannot change.
-                try:
-                    os.link((source_folder / entry.path).resolve(), temporary)
-                except OSError:
-                    shutil.copyfile(source_folder / entry.path, temporary)
-        record_entry_hashes(target_folder, new_entries)
+    for entry in new_entries:
+        check_scenario(source_folder / entry.path, entry.content_sha256)
+        with atomic_path(target_folder / entry.path) as temporary:
+            # Files are only ever replaced, so a shared one cannot change.
+            try:
+                os.link((source_folder / entry.path).resolve(), temporary)
+            except OSError:
+                shutil.copyfile(source_folder / entry.path, temporary)
+    record_entry_hashes(target_folder, new_entries)
     for environment in source_manifest.environments:
         manifest = merge_entries(size, manifest, environment=environment)
     return merge_entries(size, manifest, [*taken_entries, *new_entries])

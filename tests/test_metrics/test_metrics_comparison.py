@@ -353,28 +353,6 @@ def test_ranks_follow_the_mean_over_seeds_then_scenarios() -> None:
     assert list(ranked) == ["even", "gappy"]
 
 
-def test_one_training_used_in_two_ways_is_paired() -> None:
-    """Seeds that scatter alike on both sides cancel: SciPy's t-test of the seeds'
-    differences is left.
-    """
-    gains = np.array([0.021, 0.014, 0.026])
-    scatter = np.array([0.2, 0.5, 0.35])
-    base = np.linspace(1.0, 2.0, 20)
-    used_one_way = []
-    used_another_way = []
-    for shift, gain in zip(scatter, gains, strict=True):
-        used_one_way.append(score_of(*(base + shift - gain)))
-        used_another_way.append(score_of(*(base + shift)))
-    found = compare(used_one_way, used_another_way, paired=True)
-    expected = scipy.stats.ttest_1samp(-gains, 0.0)
-    assert found.p == pytest.approx(expected.pvalue)
-    assert found.difference == pytest.approx(-gains.mean())
-    low, high = found.interval
-    assert low < found.difference < high < 0.0
-    unpaired = compare(used_one_way, used_another_way)
-    assert unpaired.p > 0.5
-
-
 def test_seeds_of_a_method_are_compared_together() -> None:
     """Two seeds against one: means over seeds, number of seeds stated, p of the two-way
     test.

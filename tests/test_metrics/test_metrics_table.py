@@ -445,8 +445,6 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
     "changes",
     [
         {"statistic": None, "of": ()},
-        {"direction": Direction.TARGET, "perfect": None},
-        {"direction": "sideways"},
         {"of": "vorticity_mse"},
         {"name": "My metric", "of": ()},
         {"name": "", "of": ()},

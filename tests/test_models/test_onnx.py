@@ -25,7 +25,7 @@ from lagbench.data.scenario import read_scenario
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.models.export import export_onnx
-from lagbench.models.onnx_model import check_onnx, find_edges, open_onnx
+from lagbench.models.onnx_model import OnnxModel, check_onnx, find_edges
 from lagbench.models.predict_onnx import predict_onnx
 from lagbench.tensors import Batch
 from lagbench.torch import predict
@@ -50,7 +50,7 @@ def test_a_model_predicts_what_its_graph_says(
 ) -> None:
     """Straight lines, to rounding, in the frames of the task."""
     path = straight_on(tmp_path / "model.onnx")
-    model = open_onnx(path, size=SIZE, root=generated.root)
+    model = OnnxModel(path, size=SIZE, root=generated.root)
     rollout = model.roll_out(first_scenario(generated))
     input_frames = slice(0, SIZE.task.input_frames)
     with read_scenario(first_scenario(generated)) as file:
@@ -108,7 +108,7 @@ def test_an_exported_step_predicts_what_it_did(
         history=2,
         root=generated.root,
     )
-    model = open_onnx(path, size=SIZE, root=generated.root)
+    model = OnnxModel(path, size=SIZE, root=generated.root)
     assert model.parameters >= 6
     scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
@@ -134,7 +134,7 @@ def test_an_exported_step_sees_the_viscosity(
         history=2,
         root=generated.root,
     )
-    model = open_onnx(path, size=SIZE, root=generated.root)
+    model = OnnxModel(path, size=SIZE, root=generated.root)
     scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)
@@ -169,7 +169,7 @@ def test_a_step_over_a_grid_of_particles_is_exported(
         history=2,
         root=generated.root,
     )
-    model = open_onnx(path, size=SIZE, root=generated.root)
+    model = OnnxModel(path, size=SIZE, root=generated.root)
     scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)

@@ -17,7 +17,7 @@ from lagbench.data.scenario import read_scenario
 from lagbench.errors import UnreadableFileError
 from lagbench.make.generate import GenerationResult
 from lagbench.models.export import export_onnx
-from lagbench.models.onnx_model import open_onnx
+from lagbench.models.onnx_model import OnnxModel
 from lagbench.tensors import Batch, TensorBox
 from lagbench.torch import predict
 
@@ -74,7 +74,7 @@ def test_a_model_is_given_the_force_of_every_frame(
 ) -> None:
     """Its ways add up to the sum of the rows of the file, those to predict included."""
     root = tiny_split("poiseuille").root
-    model = open_onnx(driven(tmp_path / "driven.onnx"), size=POISEUILLE, root=root)
+    model = OnnxModel(driven(tmp_path / "driven.onnx"), size=POISEUILLE, root=root)
     scenario = first_scenario(POISEUILLE, root)
     position = model.predict(scenario)
     task = POISEUILLE.task
@@ -91,7 +91,7 @@ def test_a_model_is_given_centre_and_radius_of_the_obstacle(
     tmp_path: Path, tiny_split: TinySplit
 ) -> None:
     root = tiny_split("cylinder").root
-    model = open_onnx(placed(tmp_path / "placed.onnx"), size=CYLINDER, root=root)
+    model = OnnxModel(placed(tmp_path / "placed.onnx"), size=CYLINDER, root=root)
     scenario = first_scenario(CYLINDER, root)
     with read_scenario(scenario) as file:
         stated = file.header.parameters
@@ -110,7 +110,7 @@ def test_data_without_it_cannot_be_predicted(
     """The message names the input that the data set does not have."""
     size = load().size("curl-noise", "tiny")
     path = make(tmp_path / "model.onnx")
-    model = open_onnx(path, size=size, root=generated.root)
+    model = OnnxModel(path, size=size, root=generated.root)
     with pytest.raises(UnreadableFileError) as caught:
         model.predict(first_scenario(size, generated.root), 1)
     name = {driven: "body_force", placed: "obstacle"}[make]
@@ -155,7 +155,7 @@ def test_a_step_that_reads_them_is_exported(
         history=2,
         root=root,
     )
-    model = open_onnx(path, size=size, root=root)
+    model = OnnxModel(path, size=size, root=root)
     rollouts = predict(step, size.split, size=size.name, history=2, root=root)
     scenario, expected = next(rollouts)
     position = model.predict(size.path(root, scenario))

@@ -10,7 +10,6 @@ from lagbench.atomic import (
     atomic_path,
     check_output_file,
     check_writable,
-    move_together,
     remove_leftovers,
     write_atomically,
 )
@@ -67,19 +66,6 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(WorkFailedError) as caught:
         write_atomically(file / "in-the-way", b"")
     assert caught.value.where.endswith("file/in-the-way")
-
-
-def test_files_move_together(tmp_path: Path) -> None:
-    """Folders are made, and a link at one of the places is replaced."""
-    sources = [tmp_path / "new-a", tmp_path / "new-b"]
-    for path in sources:
-        path.write_text(path.name)
-    places = [tmp_path / "a", tmp_path / "deep" / "b"]
-    (tmp_path / "elsewhere").touch()
-    places[0].symlink_to(tmp_path / "elsewhere")
-    move_together(list(zip(sources, places, strict=True)))
-    assert [path.read_text() for path in places] == ["new-a", "new-b"]
-    assert (tmp_path / "elsewhere").read_text() == ""
 
 
 def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
