@@ -29,8 +29,6 @@ def export_command(
     file_format: Annotated[str, Parameter(name="--format")] = "gns-npz",
     output: OutputOption = None,
     root: RootOption = None,
-    from_walls: Annotated[bool | None, Parameter(negative="--unit-box")] = None,
-    wall_particles: bool = False,
     overwrite: OverwriteFlag = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -43,11 +41,6 @@ def export_command(
         split: Name of the split, or folder of a local one.
         file_format: gns-npz, lagrangebench-h5, or vtkhdf for ParaView.
         output: Folder of the new files; by default SPLIT-SIZE-FORMAT here.
-        from_walls: For lagrangebench-h5: the origin of the positions is the corner of
-            the lower walls, or that of the unit box, as in lagbench. Default: the walls
-            in full boxes, with moving walls and with periodic axes, else the unit box.
-        wall_particles: Add particles that move with the walls; only for two-dimensional
-            boxes with four walls.
     """
     tier = locate(split, size, root=root).size
     folder = output or Path(f"{tier.split}-{tier.name}-{file_format}")
@@ -58,8 +51,6 @@ def export_command(
             format=file_format,
             output=folder,
             root=root,
-            from_walls=from_walls,
-            wall_particles=wall_particles,
             overwrite=overwrite,
             progress=progress,
         )
@@ -81,8 +72,7 @@ def _describe(result: ExportResult) -> list[str]:
     if result.loses_wall_motion:
         lines.append(
             "  the scenarios have wall velocities, and the files do not: the format "
-            "has none. In two dimensions, with four walls, --wall-particles adds "
-            "particles that move with them (docs/exchange.md, Moving walls)"
+            "has none"
         )
     lines.append(f"  {format_bytes(result.bytes)}")
     return lines

@@ -1,13 +1,12 @@
 """Open HDF5 and netCDF files; read members and attributes as netCDF shows them.
 
 h5py opens a file in half the time that netCDF4 takes. Links are listed and never
-followed: nothing outside the file is opened. Files of strangers are checked in
-:mod:`.structure` before their values are read.
+followed: nothing outside the file is opened. Sizes that headers claim are compared with
+what the file holds before values are read.
 """
 
 from __future__ import annotations
 
-import codecs
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -47,60 +46,25 @@ MAX_LINKS = 1000
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
-FIRST_BYTES = 64
-"""Bytes by which the format of a file is told."""
-
-OTHER_FORMATS: Mapping[bytes, str] = {
-    b"CDF\x01": "netCDF-3, the old format",
-    b"CDF\x02": "netCDF-3, the old format",
-    b"CDF\x05": "netCDF-3, the old format",
-    b"PK\x03\x04": "a zip archive, perhaps .npz",
-    b"\x93NUMPY": "a NumPy .npy file",
-    b"\x1f\x8b": "a gzip archive",
-    b"\x80": "perhaps a Python pickle",
-}
-
-LAYOUTS = {
-    h5py.h5d.COMPACT: "compact",
-    h5py.h5d.CONTIGUOUS: "contiguous",
-    h5py.h5d.CHUNKED: "chunked",
-    h5py.h5d.VIRTUAL: "virtual",
-}
-
-INSIDE = ("compact", "contiguous", "chunked")
+INSIDE = (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED)
 """Layouts of arrays whose values lie in the file itself."""
-
-LINKS = {h5py.h5l.TYPE_SOFT: "soft link", h5py.h5l.TYPE_EXTERNAL: "external link"}
 
 OBJECTS = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "variable"}
 
+HARMLESS_BYTES = 1 << 28
+"""Any array or chunk may unpack to this many bytes."""
+
+MAX_ARRAY_RATIO = 200
+"""Most unpacked bytes per packed byte of a larger array. Particles at rest reach 100.
+"""
+
 NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 """Start of the name of a dimension that has no variable of its own."""
-
-DEFLATE_RATIO = 1032
-"""No zlib stream unpacks to more than this many times its length."""
 
 WRITE_AGAIN = "write the file again; if it was copied or downloaded, compare its length"
 
 
 # --- opening --------------------------------------------------------------------------
-
-
-def read_beginning(path: Path, most: int) -> bytes:
-    """Return the first bytes of a file, at most so many.
-
-    Raises:
-        UnreadableFileError: the file cannot be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            return stream.read(most)
-    except OSError as error:
-        raise UnreadableFileError(
-            f"cannot open the file: {error.strerror or error}; check the path and "
-            "that you may read the file",
-            where=str(path),
-        ) from error
 
 
 def check_file(
@@ -112,35 +76,22 @@ def check_file(
         UnreadableFileError: no regular file, too long, or another signature.
     """
     check_regular(path, longest=longest, fix=fix)
-    first_bytes = read_beginning(path, FIRST_BYTES)
-    if not first_bytes.startswith(SIGNATURE):
-        raise UnreadableFileError(
-            f"not an HDF5 file: {guess_format(first_bytes)}; {fix}", where=str(path)
-        )
-
-
-def guess_format(first_bytes: bytes) -> str:
-    """Return in plain words what a file is.
-
-    Args:
-        first_bytes: its first :data:`FIRST_BYTES` bytes, or all of a shorter file.
-    """
-    if first_bytes.startswith(SIGNATURE):
-        return "an HDF5 file"
-    for signature, format_name in OTHER_FORMATS.items():
-        if first_bytes.startswith(signature):
-            return format_name
-    if not first_bytes:
-        return "an empty file"
-    # an incremental decoder accepts a character that the end of the bytes cuts
-    decoder = codecs.getincrementaldecoder("utf-8")()
     try:
-        words = decoder.decode(first_bytes).split()
-    except UnicodeDecodeError:
-        return "bytes of another format"
-    if "".join(words).isprintable():
-        return "a text file"
-    return "bytes of another format"
+        with path.open("rb") as stream:
+            first_bytes = stream.read(len(SIGNATURE))
+    except OSError as error:
+        raise UnreadableFileError(
+            f"cannot open the file: {error.strerror or error}; check the path and "
+            "that you may read the file",
+            where=str(path),
+        ) from error
+    if first_bytes != SIGNATURE:
+        kind = "it begins with other bytes"
+        if first_bytes.startswith(b"CDF"):
+            kind = "it is netCDF-3, the old format"
+        raise UnreadableFileError(
+            f"not an HDF5 or netCDF-4 file: {kind}; {fix}", where=str(path)
+        )
 
 
 @contextmanager
@@ -203,19 +154,16 @@ def list_members(
 ) -> tuple[dict[str, str], int]:
     """Return the first members of a group with their kinds, and the number of all.
 
-    A member is a "variable", "group", "named type", "soft link", "external link" or
-    "user-defined link".
+    A member is a "variable", "group", "link" that is not followed, or "named type".
     """
     count: int = group.id.get_num_objs()
     members = {}
     for index in range(min(count, most)):
         name = group.id.get_objname_by_idx(index)
-        link_type = group.id.links.get_info(name).type
-        if link_type == h5py.h5l.TYPE_HARD:
+        kind = "link"
+        if group.id.links.get_info(name).type == h5py.h5l.TYPE_HARD:
             object_type = h5py.h5o.get_info(group.id, name).type
             kind = OBJECTS.get(object_type, "named type")
-        else:
-            kind = LINKS.get(link_type, "user-defined link")
         members[name.decode("utf-8", "backslashreplace")] = kind
     return members, count
 
@@ -229,14 +177,20 @@ def open_variable(group: h5py.Group, name: str) -> h5py.Dataset:
     return h5py.Dataset(h5py.h5d.open(group.id, name.encode()), readonly=True)
 
 
-def read_layout(creation_properties: h5py.h5p.PropDCID) -> str:
-    """Return how the values of a data set are stored.
+def find_storage_issue(variable: h5py.Dataset) -> str | None:
+    """Return why an array must not be read; None where it is sound.
 
-    One of :data:`INSIDE`, "virtual", "external files" or "unknown".
+    Its values lie in other files, or would be far more than its bytes can hold.
     """
-    if creation_properties.get_external_count():
-        return "external files"
-    return LAYOUTS.get(creation_properties.get_layout(), "unknown")
+    properties = variable.id.get_create_plist()
+    if properties.get_external_count() or properties.get_layout() not in INSIDE:
+        return "the values lie in other files"
+    item = 1 if is_text_of_any_length(variable) else variable.dtype.itemsize
+    unpacked = item * math.prod(variable.shape or (0,))
+    packed = variable.id.get_storage_size()
+    if unpacked > max(HARMLESS_BYTES, MAX_ARRAY_RATIO * packed):
+        return f"{unpacked} bytes are claimed, and the file has {packed} of them"
+    return None
 
 
 def read_dimensions(dataset: h5py.Dataset) -> tuple[str, ...]:
@@ -269,25 +223,26 @@ def read_dimensions(dataset: h5py.Dataset) -> tuple[str, ...]:
 # --- what netCDF shows ----------------------------------------------------------------
 
 
-def list_variables(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Return the variables of the root group by name.
+def list_variables(group: h5py.Group) -> dict[str, h5py.Dataset]:
+    """Return the variables of a group by name; links and groups in it are no variables.
 
     Raises:
-        DataError: a link, values in other files, or too many members.
+        DataError: a link, values in other files, arrays far larger than their bytes, or
+            too many members.
     """
-    members, count = list_members(file)
+    members, count = list_members(group)
     if count > len(members):
         raise DataError(f"{count} members, of which {len(members)} are inspected")
     variables = {}
     for name, kind in members.items():
-        if kind.endswith("link"):
-            raise DataError(f"{name!r} is a {kind}")
+        if kind == "link":
+            raise DataError(f"{name!r} is a link, which is not followed")
         if kind != "variable":
             continue
-        variable = open_variable(file, name)
-        layout = read_layout(variable.id.get_create_plist())
-        if layout not in INSIDE:
-            raise DataError(f"the values of {name!r} lie elsewhere: {layout}")
+        variable = open_variable(group, name)
+        issue = find_storage_issue(variable)
+        if issue is not None:
+            raise DataError(f"{name!r}: {issue}")
         if not _is_bare_dimension(variable):
             variables[name] = variable
     return variables

@@ -26,9 +26,7 @@ from lagbench.errors import LIMIT_FIXES, DataError, LagbenchError, WorkFailedErr
 from . import PARTICLE_KINDS
 from .checksums import ContentHasher
 from .hdf5 import (
-    DEFLATE_RATIO,
     is_text,
-    is_text_of_any_length,
     list_dimensions,
     list_variables,
     read_attribute,
@@ -398,8 +396,7 @@ def _hash_error(
 
 
 def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
-    """Refuse lengths beyond what the file can hold, before memory is asked for."""
-    most_bytes = DEFLATE_RATIO * path.stat().st_size
+    """Refuse other variables than a scenario has, and too long frames."""
     for name, variable in variables.items():
         if name not in ATTRIBUTES:
             raise damage_error(path, "no scenario has that variable", name)
@@ -409,15 +406,6 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
                 f"more than {MAX_VALUES_PER_FRAME} values in a frame: shape {shape}"
             )
             raise damage_error(path, message, name)
-        item_bytes = variable.dtype.itemsize
-        if is_text_of_any_length(variable):
-            item_bytes = 1
-        if variable.size * item_bytes > most_bytes:
-            raise DataError(
-                f"a variable is larger than its file can hold: got shape {shape}, "
-                f"expected at most {most_bytes} bytes; {_repair_hint(path)}",
-                where=f"{path}, variable {name!r}",
-            )
 
 
 def _read_header(

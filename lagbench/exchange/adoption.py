@@ -132,7 +132,7 @@ def adopt(
     if isinstance(sources, str | Path | xr.Dataset):
         sources = [sources]
     listings, stated, text = _list_subsets(sources, reading, valid=valid, test=test)
-    known_kinds = {**stated.pop("kinds", {}), **parse_kinds(kinds)}
+    known_kinds = parse_kinds(kinds)
     description = _describe({**stated, **options})
     counts = {subset: len(listing.sources) for subset, listing in listings.items()}
     total = sum(counts.values())
@@ -284,14 +284,7 @@ def _judge(
     def open_trajectory() -> Trajectory:
         with reading(source.name):
             dataset = source.open()
-        trajectory = name_trajectory(dataset, source.name, kinds)
-        if any(description.origin):
-            origin = np.array(description.origin, np.float32)
-            moved = trajectory.dataset["position"] + xr.DataArray(origin, dims="space")
-            trajectory = replace(
-                trajectory, dataset=trajectory.dataset.assign(position=moved)
-            )
-        return _drop_constant_axes(trajectory)
+        return _drop_constant_axes(name_trajectory(dataset, source.name, kinds))
 
     trajectory = open_trajectory()
     name = trajectory.name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from lagbench.data.manifest import (
     record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size, Split
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
@@ -43,7 +43,6 @@ from lagbench.store.archive import (
     list_releases,
 )
 from lagbench.store.copy import (
-    Publication,
     object_address,
     parse_manifest,
     publish,
@@ -136,7 +135,12 @@ def download(
     )
     selected = select(tier, subset=subset, scenarios=scenarios)
     description = rooted_registry.split(tier.split)
-    urls = _list_stores(mirror, description, tier)
+    if mirror is not None:
+        # else data would be simulated without it, or need no store
+        check_address(mirror)
+        urls = [mirror]
+    else:
+        urls = [*description.mirrors, *list_releases(tier)]
     with ExitStack() as stack:
         stack.enter_context(
             dataset_lock(data_root, tier.split, tier.name, tier.major, on_wait=on_wait)
@@ -145,11 +149,9 @@ def download(
         own_url = url_of(data_root)
         if own_url is not None:
             store = stack.enter_context(publish(tier, data_root, own_url))
-        stored: set[int] = set()
-        if store:
-            stored.update(store.stored_entries)
+        stored = set(store.stored_entries) if store else set()
         published = stored.intersection(selected)
-        job = DownloadJob(
+        job = _Job(
             tier,
             data_root,
             [scenario for scenario in selected if scenario not in published],
@@ -165,14 +167,19 @@ def download(
                 store.put_files(manifest)
         if not job.missing:
             verdict = compare_hashes(tier, manifest)
-            if tier.simulated and (job.downloaded or job.forgotten):
-                _describe_data(job, description, manifest, store)
+            if tier.simulated and job.has_changed:
+                if store:
+                    # cards are made from files, some of which only the store has
+                    store.fetch(tier.scenarios)
+                cards = write_cards(data_root, tier, description, manifest)
+                if store:
+                    store.put_files(manifest, cards)
 
     if job.missing:
         if not or_generate:
             raise reason
         if announce is not None:
-            announce(_describe_fallback(reason, job.missing))
+            announce(f"{reason}: simulating scenarios {format_ids(job.missing)}")
         generated = generate(
             tier.split,
             tier.name,
@@ -201,57 +208,7 @@ def download(
     )
 
 
-def _list_stores(mirror: str | None, split: Split, size: Size) -> list[str]:
-    """Return the URLs of stores in the order in which they are asked.
-
-    Raises:
-        UsageError: the named store has no address of a store. Otherwise the data would
-            be simulated without it, or need no store.
-    """
-    if mirror is not None:
-        check_address(mirror)
-        return [mirror]
-    return [*split.mirrors, *list_releases(size)]
-
-
-def _describe_data(
-    job: DownloadJob, split: Split, manifest: Manifest, store: Publication | None
-) -> None:
-    """Write the cards of a data set after a download.
-
-    If the root folder is the working copy of a store, the cards go to this store too.
-    Then the files that only the store has are fetched first, because cards are made
-    from files in the root folder.
-
-    Args:
-        job: what was fetched.
-        split: description of the split.
-        manifest: manifest of the data.
-        store: the store of which the root folder is the working copy; None without one.
-    """
-    if store:
-        store.fetch(job.size.scenarios)
-    cards = write_cards(job.root, job.size, split, manifest)
-    if store:
-        store.put_files(manifest, cards)
-
-
-def _describe_fallback(reason: Reason, scenarios: Sequence[int]) -> str:
-    """Return the sentence that says why scenarios are simulated."""
-    return f"{reason}: simulating scenarios {format_ids(scenarios)}"
-
-
-def _total_length(requests: Iterable[FetchRequest]) -> int:
-    """Return the bytes of all files; 0 where the store does not state each length."""
-    total = 0
-    for request in requests:
-        if request.length is None:
-            return 0
-        total += request.length
-    return total
-
-
-class DownloadJob:
+class _Job:
     """Find out what is missing, fetch it, and record what is there."""
 
     def __init__(
@@ -271,55 +228,36 @@ class DownloadJob:
         self.url: str | None = None  # store that files came from
         self.downloaded: list[int] = []
         self.byte_count = 0
+        self.has_changed = False  # whether other files are there than the manifest had
         self._recorded_hashes: dict[int, str] = {}
         if size.measured:
             self._recorded_hashes = dict(size.measured.scenario_sha256)
 
-        self._old_manifest = read_or_empty(size, root)
         self._entries: list[FileEntry] = []
         self.present: list[int] = []
         self.missing: list[int] = []  # still to fetch
-        # ids that were not selected and whose files are gone or wrong
-        self.forgotten: list[int] = []
+        old = read_or_empty(size, root)
         meter.begin("checking", total=len(selected), scenarios=len(selected))
         for scenario in selected:
-            if self._inspect(scenario):
+            inspected = inspect_scenario(root, size, scenario, manifest=old, quick=True)
+            if inspected.entry:
+                self._entries.append(inspected.entry)
+            if inspected.state is DataSetState.GOOD:
                 self.present.append(scenario)
             else:
                 self.missing.append(scenario)
-        for scenario in self._list_changed(selected, stored):
-            if not self._inspect(scenario):
-                self.forgotten.append(scenario)
-
-    def _inspect(self, scenario: int) -> bool:
-        """Return whether a file is there and right; note the entry of a right one."""
-        inspected = inspect_scenario(
-            self.root, self.size, scenario, manifest=self._old_manifest, quick=True
-        )
-        if inspected.entry:
-            self._entries.append(inspected.entry)
-        return inspected.state is DataSetState.GOOD
-
-    def _list_changed(
-        self, selected: Collection[int], stored: Collection[int]
-    ) -> list[int]:
-        """Return the ids of other files that are not as the old manifest states.
-
-        They have vanished, or have another length. Files in the store are right.
-        """
-        changed_ids = []
-        for entry in self._old_manifest.files:
-            scenario = entry.scenario
-            is_other = scenario not in selected and scenario not in stored
-            if not is_other or scenario not in self.size.scenarios:
-                continue
-            length = None
-            path = self.size.path(self.root, scenario)
-            if path.is_file():
-                length = path.stat().st_size
-            if length != entry.bytes:
-                changed_ids.append(scenario)
-        return changed_ids
+        # other files that are as the manifest states; those in the store are right
+        kept = []
+        for entry in old.files:
+            path = size.folder(root) / entry.path
+            is_there = path.is_file() and path.stat().st_size == entry.bytes
+            if entry.scenario in stored or (
+                entry.scenario not in self.missing and is_there
+            ):
+                kept.append(entry)
+            else:
+                self.has_changed = True
+        self._old_manifest = old.model_copy(update={"files": tuple(kept)})
 
     def run(self, urls: Iterable[str]) -> Reason:
         """Fetch what is missing from stores in turn, unless one lies.
@@ -327,10 +265,7 @@ class DownloadJob:
         Returns why something still is missing.
         """
         place = f"{self.size.split} {self.size.name}"
-        unknown = []
-        for scenario in self.missing:
-            if scenario not in self._recorded_hashes:
-                unknown.append(scenario)
+        unknown = [one for one in self.missing if one not in self._recorded_hashes]
         if unknown:
             return DataError(
                 f"no hash of scenarios {format_ids(unknown)} is recorded to check "
@@ -349,6 +284,9 @@ class DownloadJob:
                 reason = self._fetch_from(url.rstrip("/")) or reason
             except StoreUnreachableError as error:
                 reason = error
+            finally:
+                done = self.downloaded
+                self.missing = [one for one in self.missing if one not in done]
         return reason
 
     def _fetch_from(self, url: str) -> NotInStoreError | None:
@@ -356,26 +294,48 @@ class DownloadJob:
 
         Returns the error of the last file that it does not have.
         """
-        check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
+        size = self.size
+        check_disk(self.root, sum(map(size.file_bytes, self.missing)))
         claims = self._read_claims(url)
-        requests = self._list_requests(url, claims or {})
-        total = _total_length(requests.values())
+        requests = {}
+        for scenario in self.missing:
+            key = size.key(scenario)
+            claim = (claims or {}).get(scenario)
+            requests[scenario] = FetchRequest(
+                url=object_address(size, url, f"{key.subset}/{scenario:04d}.nc"),
+                target=scenario_path(self.root, key),
+                limit=size.longest_file(scenario),
+                content_sha256=self._recorded_hashes[scenario],
+                length=claim.bytes if claim else None,
+                file_sha256=claim.file_sha256 if claim else None,
+            )
+        lengths = [request.length for request in requests.values()]
+        total = 0 if None in lengths else sum(filter(None, lengths))
         self._meter.begin("downloading", total=total, scenarios=len(requests))
-        try:
-            if claims is None:
-                # A store without a manifest may have the archive of the data set.
-                if self._fetch_archive(url, requests):
-                    return None
+        if claims is None:
+            # a store without a manifest may have the archive of the data set
+            archive = fetch_archive(size, url, requests, self._count_bytes)
+            try:
+                with closing(archive) as arrived_entries:
+                    for entry in arrived_entries:
+                        self._record_file(url, entry.scenario, entry)
+                return None
+            except NotInStoreError:
                 claims = {}
-                for scenario in self.downloaded:
-                    requests.pop(scenario, None)
-            return self._fetch_files(url, requests, claims)
-        finally:
-            still_missing = []
-            for scenario in self.missing:
-                if scenario not in self.downloaded:
-                    still_missing.append(scenario)
-            self.missing = still_missing
+            for scenario in self.downloaded:
+                requests.pop(scenario, None)
+
+        last_absent = None
+        arrivals = fetch_scenarios(
+            requests, self._count_bytes, connections=self._connections
+        )
+        with closing(arrivals):
+            for scenario, absent in arrivals:
+                if absent is None:
+                    self._record_file(url, scenario, claims.get(scenario))
+                else:
+                    last_absent = absent
+        return last_absent
 
     def _read_claims(self, url: str) -> dict[int, FileEntry] | None:
         """Return what a store's manifest says of its files; None without one.
@@ -398,54 +358,6 @@ class DownloadJob:
         refuse_foreign_hashes(self.size, manifest, foreign_scenarios, where=place)
         return claims
 
-    def _list_requests(
-        self, url: str, claims: Mapping[int, FileEntry]
-    ) -> dict[int, FetchRequest]:
-        """Return what to fetch from a store, and how to check it, by scenario."""
-        requests = {}
-        for scenario in self.missing:
-            key = self.size.key(scenario)
-            claim = claims.get(scenario)
-            requests[scenario] = FetchRequest(
-                url=object_address(self.size, url, f"{key.subset}/{scenario:04d}.nc"),
-                target=scenario_path(self.root, key),
-                limit=self.size.longest_file(scenario),
-                content_sha256=self._recorded_hashes[scenario],
-                length=claim.bytes if claim else None,
-                file_sha256=claim.file_sha256 if claim else None,
-            )
-        return requests
-
-    def _fetch_archive(self, url: str, requests: Mapping[int, FetchRequest]) -> bool:
-        """Take files from the archive of the data set; return whether there is one."""
-        archive = fetch_archive(self.size, url, requests, self._count_bytes)
-        try:
-            with closing(archive) as arrived_entries:
-                for entry in arrived_entries:
-                    self._record_file(url, entry.scenario, entry)
-        except NotInStoreError:
-            return False
-        return True
-
-    def _fetch_files(
-        self,
-        url: str,
-        requests: Mapping[int, FetchRequest],
-        claims: Mapping[int, FileEntry],
-    ) -> NotInStoreError | None:
-        """Fetch files side by side; return the error of the last one not there."""
-        last_absent = None
-        arrivals = fetch_scenarios(
-            requests, self._count_progress, connections=self._connections
-        )
-        with closing(arrivals):
-            for scenario, absent in arrivals:
-                if absent is None:
-                    self._record_file(url, scenario, claims.get(scenario))
-                else:
-                    last_absent = absent
-        return last_absent
-
     def _record_file(self, url: str, scenario: int, claim: FileEntry | None) -> None:
         """Note a new file.
 
@@ -461,16 +373,13 @@ class DownloadJob:
             entry = entry.model_copy(update=update)
         self._entries.append(entry)
         self.downloaded.append(scenario)
+        self.has_changed = True
         self.url = url
         self._meter.count(scenarios=1)
 
     def _count_bytes(self, byte_count: int) -> None:
         """Count bytes that came from a store."""
         self.byte_count += byte_count
-
-    def _count_progress(self, byte_count: int) -> None:
-        """Count bytes that came from a store, all of them of requested files."""
-        self._count_bytes(byte_count)
         self._meter.count(byte_count)
 
     def write_manifest(self) -> Manifest:
@@ -480,19 +389,10 @@ class DownloadJob:
         """
         folder = self.size.folder(self.root)
         record_entry_hashes(folder, self._entries)
-        absent = {*self.missing, *self.forgotten}
-        kept_entries = []
-        for entry in self._old_manifest.files:
-            if entry.scenario not in absent:
-                kept_entries.append(entry)
-        update = {"files": tuple(kept_entries)}
-        old_manifest = self._old_manifest.model_copy(update=update)
-        manifest = merge_entries(self.size, old_manifest, self._entries)
+        manifest = merge_entries(self.size, self._old_manifest, self._entries)
         if self.size.measured and "train" in manifest.subset_sha256:
-            statistics = {}
-            for name, row in self.size.measured.statistics.items():
-                statistics[name] = tuple(row)
-            manifest = manifest.model_copy(update={"statistics": statistics})
+            update = {"statistics": self.size.measured.statistics}
+            manifest = manifest.model_copy(update=update)
         if manifest.files or (folder / MANIFEST_NAME).exists():
             write_manifest(self.root, manifest)
         return manifest

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import pickle
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,11 +25,10 @@ from lagbench.errors import UnreadableFileError
 JOINT = "gns_data"
 """Key under which some files hold all trajectories together."""
 
+SUFFIX = ".npz"
+
 KINDS = {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8, "wall": 3}
 """Number of each material."""
-
-WALLS = (3, 3)
-"""Numbers of the particles of a wall at rest, and of one that moves."""
 
 ALLOWED = {
     ("numpy", "ndarray"),
@@ -66,45 +66,40 @@ def _read_header(stream: IO[bytes]) -> np.dtype[Any]:
     return np.lib.format.read_array_header_2_0(stream)[2]
 
 
-def list_trajectories(path: Path) -> list[str]:
-    """Return the names of the trajectories of a file, in its order."""
+def list_trajectories(path: Path) -> list[tuple[str, Callable[[], xr.Dataset]]]:
+    """Return name and opener of each trajectory of a file, in its order."""
     with zipfile.ZipFile(path) as archive:
         keys = [name.removesuffix(".npy") for name in archive.namelist()]
-    if keys != [JOINT]:
-        return keys
-    return [f"{JOINT} {number}" for number in range(len(_load(path, JOINT)))]
+    trajectories = []
+    for key in keys:
+        if key != JOINT:
+            trajectories.append((key, partial(_read, path, key)))
+            continue
+        for number in range(len(_load(path, key))):
+            trajectories.append((f"{key} {number}", partial(_read, path, key, number)))
+    return trajectories
 
 
-def read(path: Path, name: str) -> xr.Dataset:
-    """Return a trajectory: positions, kinds and, where it has one, a property.
-
-    Raises:
-        UnreadableFileError: it holds something else.
-        pickle.UnpicklingError: its pickle names more than arrays.
-    """
-    key, _, number = name.partition(" ")
+def _read(path: Path, key: str, number: int | None = None) -> xr.Dataset:
+    """Return the positions and kinds of a trajectory."""
     item = _load(path, key)
-    if number:
-        item = item[int(number)]
+    if number is not None:
+        item = item[number]
     parts = list(item) if np.ndim(item) or isinstance(item, tuple) else []
     if len(parts) not in (2, 3) or np.ndim(parts[0]) != 3:
         raise UnreadableFileError(
-            f"{path}, {name} is no trajectory; save positions [frame, particle, space] "
-            "and a kind for each particle in an object array of two items"
+            f"{path}, {key} holds no trajectory; save positions [frame, particle, "
+            "space] and a kind for each particle in an object array of two items"
         )
     position = np.asarray(parts[0])
     kinds = np.broadcast_to(np.asarray(parts[1]).squeeze(), position.shape[1:2])
-    dataset = xr.Dataset(
+    return xr.Dataset(
         {
             "position": (("frame", "particle", "space"), position),
             "particle_type": ("particle", kinds),
-        }
+        },
+        attrs={"kinds": {value: material for material, value in KINDS.items()}},
     )
-    dataset.attrs["kinds"] = {value: material for material, value in KINDS.items()}
-    properties = np.unique(np.asarray(parts[2:], np.float64))
-    if len(properties) == 1 and np.isfinite(properties).all():
-        dataset.attrs["parameters"] = {"material_property": float(properties[0])}
-    return dataset
 
 
 def _load(path: Path, key: str) -> Any:  # noqa: ANN401
@@ -116,29 +111,20 @@ def _load(path: Path, key: str) -> Any:  # noqa: ANN401
 
 def write(
     path: Path, runs: Iterable[tuple[NDArray[np.float32], NDArray[np.int64]]]
-) -> list[tuple[int, int]]:
+) -> None:
     """Write one subset, whole or not at all.
 
     Equal data give equal bytes: members have zip's earliest time and are not
     compressed, since compressed bytes change with the version of zlib.
-
-    Returns:
-        Frames and particles of each trajectory.
     """
-    shapes: list[tuple[int, int]] = []
     with (
         atomic_path(path, option="--output") as temporary,
         zipfile.ZipFile(temporary, "w") as archive,
     ):
-        for position, kinds in runs:
+        for number, run in enumerate(runs):
             pair = np.empty(2, dtype=object)
-            pair[0] = position
-            pair[1] = kinds
-            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy")
+            pair[0], pair[1] = run
+            member = zipfile.ZipInfo(f"simulation_{number}.npy")
             member.external_attr = 0o644 << 16
-            header = {"descr": "|O", "fortran_order": False, "shape": pair.shape}
             with archive.open(member, "w", force_zip64=True) as stream:
-                np.lib.format.write_array_header_1_0(stream, header)
-                pickle.dump(pair, stream, protocol=4)
-            shapes.append(position.shape[:2])
-    return shapes
+                np.lib.format.write_array(stream, pair, (1, 0))

@@ -101,8 +101,6 @@ class Description(BaseModel):
     cells: int | None = Field(None, ge=FEWEST_CELLS, le=4096)
     # whether material fills the box, so that vorticity ranks; else clouds rank
     full_box: bool = False
-    # what an export of ours took off every position [length]
-    origin: tuple[float, ...] = ()
 
     @property
     def box(self) -> Box | None:
@@ -333,11 +331,7 @@ class _Writer:
             material=trajectory.material,
             particle_mass=density * self.spacings[-1] ** self.box.dimension,
             wall_velocity=wall_velocity,
-            parameters={
-                "frame_rate": self.rate,
-                "density": density,
-                **trajectory.parameters,
-            },
+            parameters={"frame_rate": self.rate, "density": density},
             seed=NO_GENERATOR,
             device=DEVICE,
             generator=NO_GENERATOR,

@@ -33,6 +33,19 @@ NAMES = {
 }
 """Variables, and the names that files have for them, in the order of preference."""
 
+COMPONENTS = {
+    "position": (
+        "{}",
+        "position_{}",
+        "position {}",
+        "pos_{}",
+        "points:{}",
+        "points_{}",
+    ),
+    "velocity": ("v{}", "velocity_{}", "vel_{}", "velocity:{}"),
+}
+"""Names of the components of vectors, with x or, as ParaView has them, 0."""
+
 SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "second": 1.0, "ms": 1e-3, "us": 1e-6}
 SECONDS |= {"ns": 1e-9, "ps": 1e-12, "min": 60.0, "minutes": 60.0, "h": 3600.0}
 SECONDS |= {"hours": 3600.0, "d": 86400.0, "days": 86400.0, "1": 1.0, "": 1.0}
@@ -64,7 +77,6 @@ class Trajectory:
     # [length/s], [wall, axis] or [frame, wall, axis]; None without walls
     wall_velocity: NDArray[np.float64] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)  # options by name
-    parameters: Mapping[str, object] = field(default_factory=dict)
     states_kinds: bool = False  # whether the file says which materials there are
     axes: tuple[int, ...] = ()  # components of the file that are kept
     notes: tuple[str, ...] = ()
@@ -210,7 +222,6 @@ def name_trajectory(
         wall_velocity=walls,
         states_kinds="kind" in variables,
         stated=stated,
-        parameters=dataset.attrs.get("parameters", {}),
         notes=(*notes, *kind_note),
     )
 
@@ -226,18 +237,22 @@ def _find(dataset: xr.Dataset, words: Sequence[str]) -> str | None:
 
 def _name_dimensions(dataset: xr.Dataset, name: str) -> xr.Dataset:
     """Return a dataset whose positions have the dimensions time, particle, space."""
+    for vector, patterns in COMPONENTS.items():
+        for pattern in patterns:
+            components = []
+            for axes in ("xyz", "012"):
+                words = [pattern.format(axis) for axis in axes]
+                components += filter(None, [_find(dataset, [word]) for word in words])
+            if len(components) > 1 and _find(dataset, NAMES[vector]) is None:
+                joined = xr.concat([dataset[one] for one in components], dim="space")
+                dataset = dataset.drop_vars(components).assign({vector: joined})
     found = _find(dataset, NAMES["position"])
     if found is None:
-        components = [axis for axis in "xyz" if axis in dataset]
-        if len(components) < 2:
-            names = ", ".join(map(str, dataset.variables))
-            raise UnreadableFileError(
-                f"{name} has no positions, but {names or 'nothing'}; name them "
-                "position, or say which they are: --positions NAME"
-            )
-        joined = xr.concat([dataset[axis] for axis in components], dim="space")
-        dataset = dataset.drop_vars(components).assign(position=joined)
-        found = "position"
+        names = ", ".join(map(str, dataset.variables))
+        raise UnreadableFileError(
+            f"{name} has no positions, but {names or 'nothing'}; name them position, "
+            "or x, y and z, or say which they are: --positions NAME"
+        )
     changed = {}
     missing = []
     for wanted, words in DIMENSIONS.items():

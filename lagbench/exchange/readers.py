@@ -32,7 +32,7 @@ from lagbench.errors import (
     require,
 )
 
-from . import gns_npz, lagrangebench_h5, vtkhdf
+from . import gns_npz, lagrangebench_h5
 
 EXTRA = "formats"
 """Extra of the libraries that read these formats."""
@@ -171,7 +171,7 @@ def _reader_of(path: Path) -> Callable[[Path, Reading], list[Source]] | None:
 
 
 def as_dataset(arrays: Mapping[str, Any], options: Reading) -> xr.Dataset:
-    """Return a dataset of arrays without named axes.
+    """Return a dataset of arrays, or variables, without named axes.
 
     The array of positions has the stated axes, others take theirs by their lengths.
     """
@@ -182,32 +182,34 @@ def as_dataset(arrays: Mapping[str, Any], options: Reading) -> xr.Dataset:
             f"no array is named position, but {', '.join(arrays) or 'none'}; name the "
             "one of the positions: --positions NAME"
         )
-    position = arrays[name]
+    shape = arrays[name].shape
     axes = tuple(options.axes)
-    if not axes and position.ndim == len(AXES):
+    if not axes and len(shape) == len(AXES):
         axes = AXES
-    if len(axes) != position.ndim:
+    if len(axes) != len(shape):
         raise UsageError(
-            f"positions have {position.ndim} axes, of shape {position.shape}; state "
-            "their order: --axes, as in trajectory,frame,particle,space"
+            f"positions have {len(shape)} axes, of shape {shape}; state their order: "
+            "--axes, as in trajectory,frame,particle,space"
         )
-    lengths = dict(zip(axes, position.shape, strict=True))
-    variables: dict[str, Any] = {}
+    lengths = dict(zip(axes, shape, strict=True))
+    variables = {}
     for key, array in arrays.items():
-        if array.shape == position.shape:
-            variables[key] = (axes, array)
-            continue
-        dims: list[str] = []
         names = ["trajectory", "frame", "particle", "space"]
         if array.ndim == 1 and key.lower() not in ("time", "times", "t"):
             names = ["trajectory", "particle", "frame", "space"]
+        dims: list[str] = []
         for length in array.shape:
             fitting = [one for one in names if lengths.get(one) == length]
             dims.append(fitting[0] if fitting else f"{key}_{len(dims)}")
             names = names[names.index(fitting[0]) + 1 :] if fitting else names
-        variables[key] = (tuple(dims), array)
-    dataset = xr.Dataset(variables)
-    return dataset.rename({name: "position"})
+        if array.shape == shape:
+            dims = list(axes)
+        if isinstance(array, xr.Variable):
+            variables[key] = array.copy(deep=False)
+            variables[key].dims = dims
+        else:
+            variables[key] = xr.Variable(dims, array)
+    return xr.Dataset(variables).rename({name: "position"})
 
 
 def _split_trajectories(
@@ -233,26 +235,20 @@ def _split_trajectories(
     return sources
 
 
-def _read_npy(path: Path, options: Reading) -> list[Source]:
-    def open_dataset() -> xr.Dataset:
-        array = np.load(path, mmap_mode="r")
-        return as_dataset({"position": array}, Reading(axes=options.axes))
-
-    return _split_trajectories(path, open_dataset)
-
-
-def _read_npz(path: Path, options: Reading) -> list[Source]:
-    if gns_npz.is_pickled(path):
-        names = gns_npz.list_trajectories(path)
+def _read_numpy(path: Path, options: Reading) -> list[Source]:
+    is_archive = path.suffix.lower() == ".npz"
+    if is_archive and gns_npz.is_pickled(path):
         return [
-            Source(name=f"{path}, {name}", open=partial(gns_npz.read, path, name))
-            for name in names
+            Source(name=f"{path}, {name}", open=open_dataset)
+            for name, open_dataset in gns_npz.list_trajectories(path)
         ]
 
     def open_dataset() -> xr.Dataset:
+        if not is_archive:
+            array = np.load(path, mmap_mode="r")
+            return as_dataset({"position": array}, Reading(axes=options.axes))
         with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
-        return as_dataset(arrays, options)
+            return as_dataset({name: file[name] for name in file.files}, options)
 
     return _split_trajectories(path, open_dataset)
 
@@ -262,26 +258,21 @@ def _read_netcdf(path: Path, options: Reading) -> list[Source]:
         engine = "zarr" if path.suffix == ".zarr" else None
         # times stay numbers with units, which say how many seconds they are
         dataset = xr.open_dataset(path, engine=engine, decode_times=False)
-        return _with_axes(dataset, options)
+        if options.positions is not None:
+            dataset = dataset.rename({options.positions: "position"})
+        if options.axes and "position" in dataset:
+            dims = zip(dataset["position"].dims, options.axes, strict=True)
+            changed = {old: new for old, new in dims if old != new}
+            dataset = dataset.rename(changed)
+        return dataset
 
     return _split_trajectories(path, open_dataset)
-
-
-def _with_axes(dataset: xr.Dataset, options: Reading) -> xr.Dataset:
-    """Return a dataset whose dimensions of the positions have the stated names."""
-    if options.positions is not None:
-        dataset = dataset.rename({options.positions: "position"})
-    if options.axes and "position" in dataset:
-        names = dict(zip(dataset["position"].dims, options.axes, strict=True))
-        changed = {old: new for old, new in names.items() if old != new}
-        dataset = dataset.rename(changed)
-    return dataset
 
 
 def _read_hdf5(path: Path, options: Reading) -> list[Source]:
     with h5py.File(path) as file:
         if "VTKHDF" in file:
-            frames = partial(vtkhdf.read_frames, path)
+            frames = partial(_vtkhdf_frames, path)
             return [Source(name=str(path), open=partial(_join, str(path), frames))]
         names: list[str] = []
         file.visit(names.append)
@@ -305,30 +296,19 @@ def _read_hdf5(path: Path, options: Reading) -> list[Source]:
 
 
 def _open_group(path: Path, group: str, name: str, axes: Sequence[str]) -> xr.Dataset:
-    """Return the arrays beside the positions in a group, which are read when needed."""
-    import dask.array
-
-    file = h5py.File(path)
+    """Return the numbers in a group, which are read when they are needed."""
+    file = xr.open_dataset(
+        path, engine="h5netcdf", group=group, phony_dims="sort", decode_times=False
+    )
     arrays = {}
-    attributes = {}
-    for key, item in file[group or "/"].items():
-        if not isinstance(item, h5py.Dataset):
-            continue
-        attributes[key] = {one: item.attrs[one] for one in item.attrs}
-        chunks = (1, *item.shape[1:]) if item.ndim > 2 else -1
-        is_number = item.dtype.kind in "iuf"
-        if is_number:
-            arrays[key] = dask.array.from_array(  # type: ignore[no-untyped-call]
-                item, chunks=chunks, name=False
-            )
-    boundary = arrays.pop("boundary", None) if name == "particles" else None
+    for key, variable in file.variables.items():
+        if variable.dtype.kind in "iuf":
+            arrays[str(key)] = variable
+    is_neural_mpm = name == "particles"
+    boundary = arrays.pop("boundary", None) if is_neural_mpm else None
     dataset = as_dataset(arrays, Reading(axes=axes, positions=name))
-    for key, values in attributes.items():
-        if key in dataset:
-            dataset[key].attrs.update(values)
-    dataset = xr.decode_cf(dataset, decode_times=False)
-    numbers = gns_npz.KINDS if name == "particles" else lagrangebench_h5.KINDS
-    if (path.parent / "metadata.json").is_file() or name == "particles":
+    numbers = gns_npz.KINDS if is_neural_mpm else lagrangebench_h5.KINDS
+    if is_neural_mpm or (path.parent / "metadata.json").is_file():
         dataset.attrs["kinds"] = {value: word for word, value in numbers.items()}
     dataset.attrs["boundary_particles"] = 0 if boundary is None else boundary.shape[-2]
     dataset.set_close(file.close)
@@ -343,22 +323,23 @@ def _join(name: str, read_frames: Callable[[], Iterator[Frame]]) -> xr.Dataset:
     columns: dict[str, list[Any]] = {}
     attributes: dict[str, Any] = {}
     count = 0
+    frame_count = 0
     for number, frame in enumerate(read_frames()):
         attributes |= frame.pop("attributes", {})
-        position = frame["position"]
+        particles = max((len(one) for one in frame.values() if np.ndim(one)), default=0)
         if number == 0:
-            count = len(position)
-        if len(position) != count:
+            count = particles
+        if particles != count:
             raise DataError(
-                f"{name}, frame {number}: {len(position)} particles, and {count} in "
+                f"{name}, frame {number}: {particles} particles, and {count} in "
                 "the frames before: particles enter or leave, which no model or score "
                 "of lagbench knows; cut the trajectory where their number changes, or "
                 "keep the particles that are in all frames"
             )
         for key, values in frame.items():
             columns.setdefault(key, []).append(values)
+        frame_count += 1
     variables: dict[str, Any] = {}
-    frame_count = len(columns.get("position", ()))
     for key, values in columns.items():
         if len(values) != frame_count or len({np.shape(one) for one in values}) > 1:
             continue  # not in all frames
@@ -403,14 +384,27 @@ def _read_frames(path: Path, options: Reading) -> list[Source]:
 
 
 def _vtk_frames(path: Path) -> Iterator[Frame]:
-    mesh = require("pyvista", extra=EXTRA).read(path)
+    yield _frame_of_mesh(require("pyvista", extra=EXTRA).read(path))
+
+
+def _vtkhdf_frames(path: Path) -> Iterator[Frame]:
+    file = require("pyvista", extra=EXTRA).HDFReader(path)
+    for step in range(max(1, file.reader.GetNumberOfSteps())):
+        file.reader.SetStep(step)
+        frame = _frame_of_mesh(file.read())
+        if file.reader.GetHasTemporalData():
+            frame["time"] = file.reader.GetTimeValue()
+        yield frame
+
+
+def _frame_of_mesh(mesh: Any) -> Frame:  # noqa: ANN401 (pyvista is optional)
     frame: Frame = {"position": np.asarray(mesh.points)}
     for name in mesh.point_data.keys():  # noqa: SIM118 (no mapping)
         frame[name] = np.asarray(mesh.point_data[name])
     for name in ("TimeValue", "TIME", "time"):
         if name in mesh.field_data:
             frame["time"] = float(mesh.field_data[name][0])
-    yield frame
+    return frame
 
 
 def _ply_frames(path: Path) -> Iterator[Frame]:
@@ -432,65 +426,28 @@ def _table_frames(path: Path) -> Iterator[Frame]:
         table = pd.read_parquet(path)
     else:
         table = pd.read_csv(path, skipinitialspace=True)
-    columns = {str(name).strip().lower(): name for name in table.columns}
-    time = next((columns[key] for key in TIME_COLUMNS if key in columns), None)
-    groups = [(None, table)] if time is None else table.groupby(time, sort=False)
-    for value, rows in groups:
-        frame = _frame_of_columns(rows.drop(columns=time or []), str(path))
-        if value is not None:
-            frame["time"] = value
-        yield frame
+    table.columns = table.columns.astype(str).str.strip()
+    names = {name.lower(): name for name in table.columns}
+    time = next((names[word] for word in TIME_COLUMNS if word in names), None)
+    if time is None:
+        yield _columns_of(table)
+        return
+    for value, rows in table.groupby(time, sort=False):
+        yield {**_columns_of(rows), "time": value}
 
 
 TIME_COLUMNS = ("time", "t", "times", "timestep", "step", "frame")
 """Columns of tables that say to which frame a row belongs."""
 
-COMPONENTS = {
-    "position": (
-        "{}",
-        "position_{}",
-        "position {}",
-        "pos_{}",
-        "points:{}",
-        "points_{}",
-    ),
-    "velocity": ("v{}", "velocity_{}", "vel_{}", "velocity:{}"),
-}
-"""Columns of the components of vectors; ParaView numbers them."""
 
-
-def _frame_of_columns(table: pd.DataFrame, where: str) -> Frame:
-    """Return the frame of a table, whose components are joined to vectors."""
-    columns = {str(name).strip().lower(): name for name in table.columns}
-    frame: Frame = {}
-    used = []
-    for name, patterns in COMPONENTS.items():
-        for pattern in patterns:
-            names = []
-            for number, axis in enumerate("xyz"):
-                for word in (axis, str(number)):
-                    if pattern.format(word) in columns:
-                        names.append(columns[pattern.format(word)])
-            if len(names) > 1 and name not in frame:
-                frame[name] = table[names].to_numpy(np.float64)
-                used += names
-    if "position" not in frame:
-        raise UnreadableFileError(
-            f"{where}: no columns x and y, but {', '.join(map(str, columns))}; name "
-            "the columns of the positions x, y and, in three dimensions, z"
-        )
-    for name in table.columns:
-        if name not in used:
-            frame[str(name).strip()] = table[name].to_numpy()
-    return frame
+def _columns_of(table: pd.DataFrame) -> Frame:
+    return {name: table[name].to_numpy() for name in table.columns}
 
 
 def _lammps_frames(path: Path) -> Iterator[Frame]:
     """Yield the frames of a text dump of LAMMPS, with its box."""
     frame: Frame = {}
     count = 0
-    low = high = np.zeros(3)
-    attributes: dict[str, Any] = {}
     with path.open() as stream:
         for line in stream:
             if line.startswith("ITEM: TIMESTEP"):
@@ -502,31 +459,21 @@ def _lammps_frames(path: Path) -> Iterator[Frame]:
             elif line.startswith("ITEM: BOX BOUNDS"):
                 if "xy" in line:
                     raise UnreadableFileError(f"{path}: the box is tilted; turn it")
-                ends = [next(stream).split()[:2] for _ in range(3)]
-                low, high = np.array(ends, float).T
-                flags = line.split()[3:] or ["ff"] * 3
-                axes = [axis for axis, flag in zip("xyz", flags, strict=True)]
-                periodic = []
-                for axis, flag in zip(axes, flags, strict=True):
-                    if flag == "pp":
-                        periodic.append(axis)
-                attributes = {"bounds": np.stack([low, high], 1), "periodic": periodic}
+                ends = [next(stream).split()[:2] for _ in "xyz"]
+                bounds = np.array(ends, float)
+                flags = zip("xyz", line.split()[3:], strict=False)
+                periodic = [axis for axis, flag in flags if flag == "pp"]
+                frame["attributes"] = {"bounds": bounds, "periodic": periodic}
             elif line.startswith("ITEM: ATOMS"):
-                names = line.split()[2:]
                 text = io.StringIO("".join(islice(stream, count)))
-                table = pd.read_csv(text, sep=r"\s+", names=names)
-                for number, axis in enumerate("xyz"):
+                table = pd.read_csv(text, sep=r"\s+", names=line.split()[2:])
+                for axis, (low, high) in zip("xyz", bounds, strict=True):
                     for scaled in (f"{axis}s", f"{axis}su"):
                         if scaled in table:
-                            length = high[number] - low[number]
-                            table[axis] = low[number] + length * table.pop(scaled)
+                            table[axis] = low + (high - low) * table.pop(scaled)
                     if f"{axis}u" in table:
                         table[axis] = table.pop(f"{axis}u")
-                yield {
-                    **frame,
-                    **_frame_of_columns(table, str(path)),
-                    "attributes": attributes,
-                }
+                yield {**frame, **_columns_of(table)}
 
 
 def _xyz_frames(path: Path) -> Iterator[Frame]:
@@ -543,11 +490,11 @@ def _xyz_frames(path: Path) -> Iterator[Frame]:
                 frame["time"] = float(value)
         lengths = atoms.cell.lengths()
         if lengths.all() and np.allclose(np.diag(lengths), atoms.cell[:]):
-            periodic = [
-                axis for axis, ends in zip("xyz", atoms.pbc, strict=True) if ends
-            ]
-            bounds = [(0.0, length) for length in lengths]
-            frame["attributes"] = {"bounds": bounds, "periodic": periodic}
+            flags = zip("xyz", atoms.pbc, strict=True)
+            frame["attributes"] = {
+                "bounds": [(0.0, length) for length in lengths],
+                "periodic": [axis for axis, is_periodic in flags if is_periodic],
+            }
         yield frame
 
 
@@ -556,7 +503,7 @@ FRAMES: dict[str, Callable[[Path], Iterator[Frame]]] = {
     ".vtu": _vtk_frames,
     ".vtp": _vtk_frames,
     ".pvd": _pvd_frames,
-    ".vtkhdf": vtkhdf.read_frames,
+    ".vtkhdf": _vtkhdf_frames,
     ".ply": _ply_frames,
     ".csv": _table_frames,
     ".parquet": _table_frames,
@@ -568,8 +515,8 @@ FRAMES: dict[str, Callable[[Path], Iterator[Frame]]] = {
 """Readers of the frames of a file, by its suffix."""
 
 READERS: dict[str, Callable[[Path, Reading], list[Source]]] = {
-    ".npy": _read_npy,
-    ".npz": _read_npz,
+    ".npy": _read_numpy,
+    ".npz": _read_numpy,
     ".nc": _read_netcdf,
     ".zarr": _read_netcdf,
     ".h5": _read_hdf5,
@@ -603,15 +550,6 @@ def read_metadata(folder: Path) -> dict[str, Any]:
         flags = values.get("periodic_boundary_conditions") or ()
         axes = zip("xyz", flags, strict=False)
         stated["periodic"] = [axis for axis, is_periodic in axes if is_periodic]
-        own = values.get("lagbench") or {}
-        for name in ("bounds", "spacing", "density", "input_frames", "horizon"):
-            stated[name] = own.get(name, stated.get(name))
-        for name in ("frames_of_interest", "cells", "origin"):
-            stated[name] = own.get(name)
-        walls = own.get("wall_particle_type") or ()
-        stated["kinds"] = dict.fromkeys(map(str, walls), "drop")
-        if "placement" in own:
-            stated["full_box"] = own["placement"] == "cell_centres"
         return {name: value for name, value in stated.items() if value is not None}
     except (ValueError, AttributeError, TypeError) as error:
         raise UnreadableFileError(

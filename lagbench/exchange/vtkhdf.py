@@ -6,13 +6,10 @@ https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.data.scenario import read_scenario
@@ -21,8 +18,8 @@ VERTEX = 1
 """Number of the cell type of a single point."""
 
 
-def write(path: Path, scenario: Path) -> tuple[int, int]:
-    """Write a scenario file, whole or not at all; return its frames and particles.
+def write(path: Path, scenario: Path) -> None:
+    """Write a scenario file, whole or not at all.
 
     Positions [length] and velocities [length/s] get a third component, 0, in two
     dimensions. Materials and ids are written once.
@@ -81,28 +78,3 @@ def write(path: Path, scenario: Path) -> tuple[int, int]:
                 components = source.read(name, slice(frame, frame + 1))[0]
                 values[:, : components.shape[1]] = components
                 stored[starts[frame] : starts[frame] + particle_count] = values
-    return frame_count, particle_count
-
-
-def read_frames(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the arrays of each frame by name, of files of one part for each time."""
-    with h5py.File(path) as file:
-        root = file["VTKHDF"]
-        times: list[float | None] = [None]
-        starts: NDArray[np.int64] = np.zeros(1, int)
-        if "Steps" in root:
-            times = root["Steps/Values"][:].tolist()
-            starts = root["Steps/PointOffsets"][:]
-        counts = root["NumberOfPoints"][:]
-        for number, time in enumerate(times):
-            count = counts[number % len(counts)]
-            frame: dict[str, Any] = {
-                "position": root["Points"][starts[number] : starts[number] + count]
-            }
-            for name, array in root.get("PointData", {}).items():
-                offsets = root.get(f"Steps/PointDataOffsets/{name}")
-                start = starts[number] if offsets is None else offsets[number]
-                frame[name] = array[start : start + count]
-            if time is not None:
-                frame["time"] = time
-            yield frame

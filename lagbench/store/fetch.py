@@ -11,9 +11,7 @@ from pathlib import Path
 
 from lagbench.atomic import SUFFIX
 from lagbench.data.checksums import file_sha256
-from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.scenario import check_scenario
-from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 
 from .objects import NotInStoreError, WrongContentError, download_object
@@ -111,8 +109,6 @@ def accept(request: FetchRequest) -> None:
         expected_hash = request.file_sha256
         if expected_hash is not None and file_sha256(partial) != expected_hash:
             raise DataError("its bytes are not those of the store's manifest")
-        with open_hdf5(partial) as file:
-            check_structure(file, partial, Structure(texts=True))
         check_scenario(partial, request.content_sha256)
     except (DataError, UnreadableFileError) as error:
         raise WrongContentError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,17 +32,16 @@ from lagbench.data.hdf5 import (
     list_members,
     open_variable,
 )
-from lagbench.data.structure import (
+from lagbench.errors import UnreadableFileError, UsageError, suggest_name
+
+from .budget import Budget
+from .headers import (
     MAX_ATTRIBUTE,
     ArrayInfo,
     UnusableAttribute,
     describe_array,
-    find_storage_issue,
     read_single_value,
 )
-from lagbench.errors import UnreadableFileError, UsageError, suggest_name
-
-from .budget import Budget
 from .issues import IssueCollector, quote
 from .provenance import TrainingProvenance
 
@@ -282,11 +281,10 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
                     value = read_single_value(dataset, attribute)
                     if value is not None:
                         packing[attribute] = value
-            elif is_coordinate_readable(array, length=length):
+            elif is_coordinate_readable(array):
                 integers[name] = tuple(int(value) for value in dataset[...])
             if name != "particle":  # without values netCDF keeps a float in its place
-                # A scalar has no dimensions to check.
-                arrays[name] = array if array.shape else replace(array, shape=None)
+                arrays[name] = array
     components: tuple[str, ...] = ()
     if links.get("space") == "variable":
         with hdf5_errors(path, "space"):
@@ -305,18 +303,14 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
     )
 
 
-def is_coordinate_readable(array: ArrayInfo, *, length: int) -> bool:
-    """Return whether an array is a list of integers that is safe to read.
-
-    ``length`` is that of the file [bytes].
-    """
+def is_coordinate_readable(array: ArrayInfo) -> bool:
+    """Return whether an array is a list of integers that is safe to read."""
     return (
         array.shape is not None
         and len(array.shape) == 1
         and array.shape[0] <= MAX_COORDINATE
         and array.chunk_bytes <= MAX_COORDINATE_CHUNK
         and array.kind.lstrip("u").startswith("int")
-        and not find_storage_issue(array, length=length)
     )
 
 
@@ -331,7 +325,7 @@ def check_layout(
         Whether the positions can be read.
     """
     for name, kind in info.links.items():
-        if kind.endswith("link"):
+        if kind == "link":
             issues.error(
                 "format",
                 f"a {kind} is not followed; store the values themselves",
@@ -345,7 +339,7 @@ def check_layout(
         )
     for name in ("position", "scenario", "frame"):
         kind = info.links.get(name, "")
-        if kind != "variable" and not kind.endswith("link"):
+        if kind not in ("variable", "link"):
             known = [quote(stored)[1:-1] for stored in info.links]
             issues.error(
                 "format",
@@ -354,10 +348,8 @@ def check_layout(
             )
     for name, array in info.arrays.items():
         where = f"variable {name!r}"
-        problem = find_storage_issue(array, length=info.length)
-        if problem is not None:
-            what = f"{problem.what}: {problem.got}; {WRITE}"
-            issues.error("format", what, where=where)
+        if array.issue is not None:
+            issues.error("format", f"{array.issue}; {WRITE}", where=where)
         elif name != "position" and name not in info.integers:
             issues.error(
                 "format",
@@ -373,7 +365,7 @@ def check_layout(
         value = info.attributes.get(name)
         reason = f"{fault['msg']}, got {quote(value)}"
         if isinstance(value, UnusableAttribute):
-            reason = value.reason
+            reason = "neither one text nor one number"
         issues.error(
             "format",
             f"{reason}; set it: file.{name} = ...",

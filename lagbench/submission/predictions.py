@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from lagbench.data.checksums import ContentHasher
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.layout import expand_home, format_ids
-from lagbench.data.structure import estimate_chunk_cache
 from lagbench.errors import UsageError
 
 from .format import (
@@ -25,6 +24,7 @@ from .format import (
     check_layout,
     inspect_file,
 )
+from .headers import estimate_chunk_cache
 from .issues import IssueCollector
 
 BLOCK_BYTES = 1 << 20
