@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lagbench.data import WALL
 from lagbench.data.box import parse_obstacle
-from lagbench.data.layout import dataset_folder, has_file
+from lagbench.data.layout import dataset_folder
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
@@ -95,7 +95,7 @@ def find_forcing(size: Size, root: Path) -> frozenset[str]:
     """
     for scenario in size.scenarios:
         path = size.path(root, scenario)
-        if has_file(path):
+        if path.is_file():
             break
     else:
         return frozenset()

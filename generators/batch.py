@@ -19,12 +19,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from lagbench.data.registry import Size
-from lagbench.data.variables import (
-    POSSIBLE_NAME,
-    STORABLE_VALUE,
-    as_attribute,
-    find_name_fault,
-)
 from lagbench.errors import (
     UsageError,
     WorkFailedError,
@@ -130,15 +124,6 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             "InitialState; return an InitialState: docs/extending.md",
             where=where,
         )
-    # The solver checks the arrays.
-    for name, value in state.parameters.items():
-        is_truth = isinstance(value, bool | np.bool_)
-        if find_name_fault(name) or is_truth or as_attribute(value) is None:
-            raise UsageError(
-                f"a parameter of an initial state cannot be stored: {value!r:.80}; "
-                f"expected {POSSIBLE_NAME}, and {STORABLE_VALUE}",
-                where=f"{where}, scenario {scenario}, parameter {name!r}",
-            )
     stated_start = start_frame(size, scenario)
     if state.start_frame != stated_start:
         raise UsageError(

@@ -9,10 +9,7 @@ from typing import Any
 
 from lagbench.data.box import describe_bounds
 from lagbench.data.layout import (
-    STORE_FILE,
-    ClosedFolderError,
     format_ids,
-    refuse_closed_folder,
     url_of,
 )
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
@@ -58,7 +55,6 @@ LEGEND = (
 def list_command(*, root: RootOption = None, as_json: JsonFlag = False) -> None:
     """List all splits and sizes, their cost, and the data on this machine."""
     folder = resolve_root(root)
-    refuse_closed_folder(folder / STORE_FILE)
     registry = load_rooted_registry(folder, load())
     overviews: list[Overview] = []
     for name in registry.splits:
@@ -85,7 +81,7 @@ def _overviews_of_split(registry: Registry, split: str, folder: Path) -> list[Ov
     for size_name in registry.split(split).sizes:
         try:
             overviews.append(overview(registry.size(split, size_name), folder))
-        except ClosedFolderError as error:
+        except OSError as error:
             print_warning(f"{split} {size_name} is left out: {error}")
     return overviews
 

@@ -57,16 +57,8 @@ class Box:
         """Refuse boxes without extent and those that are neither flat nor solid.
 
         Raises:
-            UsageError: the dimension is not 2 or 3, the parts differ in length, or an
-                axis has no extent.
+            UsageError: the dimension is not 2 or 3, or an axis has no extent.
         """
-        if not len(self.low) == len(self.high) == len(self.periodic):
-            raise UsageError(
-                f"the parts of a box differ in dimension: {len(self.low)}, "
-                f"{len(self.high)} and {len(self.periodic)}; give a low, a high and a "
-                "periodic value for each axis",
-                where="low, high, periodic",
-            )
         if self.dimension not in (2, 3):
             raise UsageError(
                 f"a box has two or three dimensions: {self.dimension}; give a value "

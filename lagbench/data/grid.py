@@ -18,6 +18,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -316,25 +317,19 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
             "both for the same particles",
             where="position and velocity",
         )
-    scatter = scatter_in_box
-    if dimension == 2 and not grid.box.is_periodic:
-        scatter = _scatter_between_walls
-
     # sum(w) and the components of sum(w u), shape [..., 1 + axis, *node]
     batch_shape = x.shape[:-2]
     sums = np.empty((*batch_shape, 1 + dimension, *grid.shape))
     for frame in np.ndindex(batch_shape):  # a frame fits the cache, a batch does not
-        scatter(x[frame], u[frame], grid, sums[frame])
+        _scatter(x[frame], u[frame], grid, sums[frame])
     by_component = np.moveaxis(sums, -1 - dimension, -1)  # [..., *node, 1 + axis]
     weight = by_component[..., 0]
     momentum = by_component[..., 1:]
     return Transfer(weight, momentum)
 
 
-def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
+def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     """Write ``sum(w)`` and the components of ``sum(w u)`` of one frame.
-
-    It serves any number of axes, with walls or periodic.
 
     Args:
         x: particle positions [length], shape [particle, axis].
@@ -342,60 +337,58 @@ def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
         grid: grid of the fields.
         out: receives the sums, shape [1 + axis, *node].
     """
-    periodic = np.asarray(grid.box.periodic)
-    x = grid.box.wrap(x)
-    is_axis_inside = np.where(periodic, np.isfinite(x), (x >= 0.0) & (x <= 1.0))
-    is_inside = is_axis_inside.all(axis=1)
-    if not is_inside.all():
-        x = x[is_inside]
+    box = grid.box
+    x = box.wrap(x)
+    # nearly always in truth; NaN is not inside either
+    is_all_inside = x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
+    if box.is_periodic or not is_all_inside:
+        is_inside = np.where(box.periodic, np.isfinite(x), (x >= 0.0) & (x <= 1.0))
+        is_inside = is_inside.all(axis=1)
+        x = x[is_inside] - grid.start
         u = u[is_inside]
-    base, weights = _spline_weights(x - grid.start, grid)
-
-    # 1 and the components of u in pairs: both of a pair go into one sum of complex
-    # numbers, which takes less time than two sums of real ones.
-    pair_count = (len(out) + 1) // 2
-    carried = np.zeros((pair_count, len(x)), np.complex128)
-    carried[0].real = 1.0
-    for row, component in enumerate(u.T, start=1):
-        pair = carried[row // 2]
-        part = _part_of_pair(pair, row)
-        part[:] = component
+    base, weights = _spline_weights(x, grid)
 
     # Number of the lowest node around each particle, on a grid with margins. The
     # target is shifted to the other nodes instead.
-    padded_shape = tuple(count + _ROWS_BELOW + _ROWS_ABOVE for count in grid.shape)
-    strides = np.ones(len(padded_shape), np.intp)
-    strides[:-1] = np.cumprod(padded_shape[:0:-1])[::-1]
-    corner = ((base.T + _ROWS_BELOW) @ strides).astype(np.intp)
-    size = int(np.prod(padded_shape))
-    largest_shift = 2 * int(strides.sum())
-    sums = np.zeros((pair_count, size + largest_shift), np.complex128)
+    padded_shape = [count + _ROWS_BELOW + _ROWS_ABOVE for count in grid.shape]
+    strides = [math.prod(padded_shape[axis + 1 :]) for axis in range(grid.dimension)]
+    base += _ROWS_BELOW
+    corner = base[0] * strides[0]
+    for row, stride in zip(base[1:], strides[1:], strict=True):
+        corner += stride * row
+    corner = corner.astype(np.intp)
+    size = math.prod(padded_shape)
+    padded_size = size + 2 * sum(strides)
+
+    # Two sums are one of complex numbers, which takes less time than two of real ones.
+    # In two dimensions the weight is left over.
+    rows: list[Floats | None] = [None, *np.ascontiguousarray(u.T)]
+    lone_sum = np.zeros(padded_size) if grid.dimension == 2 else None
+    paired = rows[grid.dimension == 2 :]
+    pair_sums = [np.zeros(padded_size, np.complex128) for _ in paired[::2]]
     weight = np.empty(len(x))
     product = np.empty(len(x), np.complex128)
     for offsets in itertools.product(range(3), repeat=grid.dimension):
-        shift = int(np.dot(offsets, strides))
+        shift = sum(map(operator.mul, offsets, strides))
         np.multiply(weights[0, offsets[0]], weights[1, offsets[1]], out=weight)
         if grid.dimension == 3:
             weight *= weights[2, offsets[2]]
-        for row_sum, values in zip(sums, carried, strict=True):
-            np.multiply(weight, values, out=product)
-            np.add.at(row_sum[shift:], corner, product)
+        if lone_sum is not None:
+            np.add.at(lone_sum[shift:], corner, weight)
+        for number, pair_sum in enumerate(pair_sums):
+            first = paired[2 * number]
+            if first is None:
+                product.real = weight
+            else:
+                np.multiply(weight, first, out=product.real)
+            np.multiply(weight, paired[2 * number + 1], out=product.imag)
+            np.add.at(pair_sum[shift:], corner, product)
 
-    for number, row in enumerate(out):
-        pair_sum = sums[number // 2, :size]
-        part = _part_of_pair(pair_sum, number)
-        padded = part.reshape(padded_shape)
-        row[:] = _fold(padded, grid)
-
-
-def _part_of_pair(pair: NDArray[np.complex128], row: int) -> Floats:
-    """Return the part of a pair that belongs to a row: real if even, imaginary if odd.
-
-    It is a view: writing to it changes the pair.
-    """
-    if row % 2:
-        return pair.imag
-    return pair.real
+    sums = [] if lone_sum is None else [lone_sum]
+    for pair_sum in pair_sums:
+        sums += [pair_sum.real, pair_sum.imag]
+    for field, padded in zip(out, sums, strict=True):
+        field[:] = _fold(padded[:size].reshape(padded_shape), grid)
 
 
 def _fold(padded: Floats, grid: Grid) -> Floats:
@@ -405,61 +398,13 @@ def _fold(padded: Floats, grid: Grid) -> Floats:
     """
     for axis, is_periodic in enumerate(grid.box.periodic):
         along = np.moveaxis(padded, axis, 0)
-        inner = along[_ROWS_BELOW : _ROWS_BELOW + grid.shape[axis]].copy()
+        inner = along[_ROWS_BELOW:-_ROWS_ABOVE]
         if is_periodic:
+            inner = inner.copy()
             inner[-_ROWS_BELOW:] += along[:_ROWS_BELOW]
             inner[:_ROWS_ABOVE] += along[-_ROWS_ABOVE:]
         padded = np.moveaxis(inner, 0, axis)
     return padded
-
-
-def _scatter_between_walls(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
-    """Do the same as :func:`scatter_in_box` in two dimensions between walls, faster.
-
-    Args:
-        x: particle positions [length], shape [particle, 2].
-        u: particle velocities, shape [particle, 2].
-        grid: grid of the fields.
-        out: receives the sums, shape [3, x node, y node].
-    """
-    # NaN is not inside either.
-    all_inside = x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
-    if not all_inside:
-        is_inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
-        x = x[is_inside]
-        u = u[is_inside]
-    base, weights = _spline_weights(x, grid)
-    along_x, along_y = np.ascontiguousarray(u.T)
-
-    # Number of the lowest of the 9 nodes around each particle, on a grid with margins.
-    side = grid.nodes + _ROWS_BELOW + _ROWS_ABOVE
-    base += _ROWS_BELOW
-    base[0] *= side
-    corner = (base[0] + base[1]).astype(np.intp)
-
-    # Node numbers stay those of the corner; the target is shifted to the node instead.
-    size = side * side
-    padded_size = size + 2 * side + 2
-    weight_sum = np.zeros(padded_size, np.float64)
-    # Both components go into one sum of complex numbers, which takes less time than two
-    # sums of real ones.
-    momentum_sum = np.zeros(padded_size, np.complex128)
-    weight = np.empty(len(corner))
-    product = np.empty(len(corner), np.complex128)
-    for i in range(3):
-        for k in range(3):
-            shift = i * side + k
-            np.multiply(weights[0, i], weights[1, k], out=weight)
-            np.add.at(weight_sum[shift:], corner, weight)
-            np.multiply(weight, along_x, out=product.real)
-            np.multiply(weight, along_y, out=product.imag)
-            np.add.at(momentum_sum[shift:], corner, product)
-
-    inner = slice(_ROWS_BELOW, -_ROWS_ABOVE)
-    padded_sums = (weight_sum, momentum_sum.real, momentum_sum.imag)
-    for field, padded_sum in zip(out, padded_sums, strict=True):
-        square = padded_sum[:size].reshape(side, side)
-        field[:] = square[inner, inner]
 
 
 def _spline_weights(x: Floats, grid: Grid) -> tuple[Floats, Floats]:

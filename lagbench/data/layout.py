@@ -19,13 +19,12 @@ import os
 import re
 import shlex
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import platformdirs
 
-from lagbench.errors import DataError, UsageError, hide_credentials
+from lagbench.errors import UsageError, hide_credentials
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
 """Environment variable for the folder of working copies and of measured speeds."""
@@ -88,31 +87,12 @@ def working_copy_of(url: str) -> Path:
     address = hide_credentials(url, mark="")
     words = re.sub(r"[^A-Za-z0-9._]+", "-", address).strip("-.")[:60]
     digest = hashlib.sha256(url.encode()).hexdigest()
-    try:
-        stores = cache_folder("stores")
-    except RuntimeError as error:
-        raise no_home_error(CACHE_VARIABLE) from error
-    return stores / f"{words}-{digest[:8]}"
-
-
-def cache_folder(part: str) -> Path:
-    """Return a folder of the user's cache, or the folder of ``LAGBENCH_CACHE``.
-
-    Args:
-        part: name of the folder in the user's cache. The folder of ``LAGBENCH_CACHE``
-            holds all parts together.
-
-    Raises:
-        RuntimeError: the user has no home folder.
-        UsageError: ``LAGBENCH_CACHE`` begins with the home folder of an unknown user.
-    """
     folder = os.environ.get(CACHE_VARIABLE)
     if folder:
-        return expand_path(folder, CACHE_VARIABLE)
-    cache = platformdirs.user_cache_path("lagbench", appauthor=False)
-    if not cache.is_absolute():  # older versions of platformdirs begin it with ~
-        raise RuntimeError(str(cache))
-    return cache / part
+        stores = expand_path(folder, CACHE_VARIABLE)
+    else:
+        stores = platformdirs.user_cache_path("lagbench", appauthor=False) / "stores"
+    return refuse_homeless(stores, CACHE_VARIABLE) / f"{words}-{digest[:8]}"
 
 
 MANIFEST_NAME = "manifest.json"
@@ -278,16 +258,18 @@ def expand_home(path: str | Path, where: str) -> Path:
     return Path(path)
 
 
-def no_home_error(where: str) -> UsageError:
-    """Return the error for a user without a home folder, as in some containers.
+def refuse_homeless(folder: Path, where: str) -> Path:
+    """Return a folder of the user; refuse it where the user has no home folder.
 
     Args:
-        where: the option or variable that names another folder.
+        folder: the folder.
+        where: the option or variable that names another one.
     """
-    return UsageError(
-        f"you have no home folder: no home folder; set HOME, or name a folder: {where}",
-        where=where,
-    )
+    if not folder.is_absolute():  # as in some containers
+        raise UsageError(
+            f"you have no home folder; set HOME, or name a folder: {where}", where=where
+        )
+    return folder
 
 
 def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:
@@ -303,51 +285,6 @@ def scenario_path(root: Path, key: ScenarioKey) -> Path:
     """Return the path of a scenario file."""
     folder = dataset_folder(root, key.split, key.size, key.major)
     return folder / key.subset / f"{key.scenario:04d}.nc"
-
-
-class ClosedFolderError(DataError):
-    """A folder of a data set may not be read."""
-
-
-def has_file(path: Path) -> bool:
-    """Return whether a file of a data set is there.
-
-    Raises:
-        ClosedFolderError: a folder above it may not be read.
-    """
-    refuse_closed_folder(path)
-    return path.is_file()
-
-
-def refuse_closed_folder(path: Path) -> None:
-    """Refuse a path below a folder that may not be read.
-
-    Raises:
-        ClosedFolderError: nobody can tell whether the path exists.
-    """
-    folder = find_closed_folder(path)
-    if folder is not None:
-        name = shlex.quote(str(folder))
-        raise ClosedFolderError(
-            "a folder of data may not be read: permission denied; see who owns it: ls "
-            f"-ld {name}; chmod +rx {name} lets others read it",
-            where=str(folder),
-        )
-
-
-def find_closed_folder(path: Path) -> Path | None:
-    """Return the folder that hides whether a path exists; None where none does."""
-    try:
-        path.stat()
-    except PermissionError:
-        for folder in path.parents:
-            # Folders below the closed one are hidden as the path is.
-            with suppress(PermissionError):
-                folder.stat()
-                return folder
-    except (OSError, ValueError):
-        return None
-    return None
 
 
 def generation_command(path: Path) -> str | None:

@@ -34,15 +34,12 @@ from lagbench.errors import (
 from .checksums import load_recorded_hashes, record_hashes
 from .layout import (
     CACHE_VARIABLE,
-    MANIFEST_NAME,
     STORE_FILE,
     as_url,
     dataset_folder,
     expand_path,
-    find_closed_folder,
-    has_file,
-    no_home_error,
     quote_root,
+    refuse_homeless,
     url_of,
     working_copy_of,
 )
@@ -92,13 +89,8 @@ def resolve_root(root: str | Path | None = None) -> Path:
     """
     named_root = _named_root(root)
     if named_root is None:
-        try:
-            folder = platformdirs.user_data_path("lagbench", appauthor=False)
-        except RuntimeError as error:
-            raise no_home_error(_ROOT_OPTION) from error
-        if not folder.is_absolute():  # older versions of platformdirs begin it with ~
-            raise no_home_error(_ROOT_OPTION)
-        return folder
+        folder = platformdirs.user_data_path("lagbench", appauthor=False)
+        return refuse_homeless(folder, _ROOT_OPTION)
     url = as_url(named_root)
     if url is not None:
         copy = working_copy_of(url)
@@ -304,7 +296,7 @@ def locate_split(
         )
     path = Path(os.path.abspath(expand_path(text, "--split")))
     has_separator = "/" in text or os.sep in text or text in {".", "..", "~"}
-    if path.name == DESCRIPTION and has_file(path):
+    if path.name == DESCRIPTION and path.is_file():
         return _locate_folder(path.parent, root, registry)
     if has_separator or not isinstance(split, str):
         return _locate_folder(path, root, registry)
@@ -313,7 +305,7 @@ def locate_split(
     try:
         rooted_registry.split(text)
     except UsageError:
-        if root is None and has_file(path / DESCRIPTION):
+        if root is None and (path / DESCRIPTION).is_file():
             return _locate_folder(path, root, registry)
         raise
     return SplitLocation(text, folder, rooted_registry)
@@ -331,7 +323,7 @@ def _locate_folder(
             f"{parent}; give the path alone, or the root and the split's name",
             where="the split (SPLIT or --split) and --root",
         )
-    if not has_file(folder / DESCRIPTION) or not is_split_name(name):
+    if not (folder / DESCRIPTION).is_file() or not is_split_name(name):
         raise UsageError(
             f"no local split there: got {folder}, expected the name of a split, or a "
             f"folder that holds {DESCRIPTION}, named like its split; lagbench list "
@@ -414,9 +406,7 @@ def _size_with_data(location: SplitLocation) -> str:
     sizes_with_data = []
     for size in sizes:
         folder = dataset_folder(root, split, size.name, size.major)
-        # A folder that may not be read is there too: whoever reads it will say so.
-        is_closed = find_closed_folder(folder / MANIFEST_NAME) is not None
-        if is_closed or any(folder.glob("*/*.nc")):
+        if any(folder.glob("*/*.nc")):
             sizes_with_data.append(size)
     names = [size.name for size in sizes_with_data]
     if len(names) == 1:

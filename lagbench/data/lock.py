@@ -8,12 +8,10 @@ inherit the lock.
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -26,20 +24,7 @@ from lagbench.errors import WorkFailedError
 from .layout import dataset_folder
 
 LOCK_NAME = ".lock"
-HOLDER_NAME = ".lock.holder.json"
-
-
-@dataclass(frozen=True)
-class Holder:
-    """The process that holds a lock."""
-
-    pid: int  # process id
-    host: str  # name of its machine
-    since: str  # when it took the lock, ISO 8601 in UTC
-
-    def __str__(self) -> str:
-        """Return the holder in words."""
-        return f"process {self.pid} on {self.host}, since {self.since}"
+HOLDER_NAME = ".lock.holder"
 
 
 @contextmanager
@@ -76,12 +61,9 @@ def dataset_lock(
             where=str(error.filename or folder),
         ) from error
     try:
-        holder = Holder(
-            pid=os.getpid(),
-            host=socket.gethostname(),
-            since=datetime.now(UTC).isoformat(timespec="seconds"),
-        )
-        write_atomically(folder / HOLDER_NAME, json.dumps(asdict(holder)).encode())
+        since = datetime.now(UTC).isoformat(timespec="seconds")
+        holder = f"process {os.getpid()} on {socket.gethostname()}, since {since}"
+        write_atomically(folder / HOLDER_NAME, holder.encode())
         yield
     finally:
         with suppress(OSError):
@@ -98,25 +80,17 @@ def _acquire(
         lock.acquire(timeout=0)
         return lock
 
-    first_holder = read_holder(folder) or "another process"
+    holder = "another process"
+    with suppress(OSError, ValueError):
+        holder = (folder / HOLDER_NAME).read_text(encoding="utf-8")
     if on_wait is not None and timeout != 0:
-        on_wait(str(first_holder))
+        on_wait(holder)
     try:
         lock.acquire(timeout=-1 if timeout is None else timeout)
     except filelock.Timeout:
         raise WorkFailedError(
-            "another process writes this data set: "
-            f"{read_holder(folder) or first_holder}; wait until it ends, or end it; "
-            "files that are complete stay",
+            f"another process writes this data set: {holder}; wait until it ends, or "
+            "end it; files that are complete stay",
             where=str(folder),
         ) from None
     return lock
-
-
-def read_holder(folder: Path) -> Holder | None:
-    """Return the last holder of a data set's lock; None where none can be read."""
-    try:
-        text = (folder / HOLDER_NAME).read_text(encoding="utf-8")
-        return Holder(**json.loads(text))
-    except (OSError, ValueError, TypeError, RecursionError):
-        return None

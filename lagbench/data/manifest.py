@@ -194,7 +194,7 @@ def build_manifest(
 
     Args:
         old: manifest before; None for an empty one.
-        files: new entries.
+        files: new entries; old ones stay only if their subset still lists them.
         split: name of the split.
         size: name of the size.
         version: semantic version of the split.
@@ -203,8 +203,17 @@ def build_manifest(
         recorded: first digits of the content hashes of datasets.yaml, by id.
         statistics: statistics over train; the old ones where train is unchanged.
     """
-    entries = _collect_entries(old, files, subsets)
-    subset_hashes = _hash_complete_subsets(entries, subsets)
+    entries = {}
+    for entry in () if old is None else old.files:
+        if entry.scenario in subsets.get(entry.subset, ()):
+            entries[entry.scenario] = entry
+    for entry in files:
+        entries[entry.scenario] = entry
+    subset_hashes = {}
+    for name, ids in subsets.items():
+        if all(scenario in entries for scenario in ids):
+            contents = {scenario: entries[scenario].content_sha256 for scenario in ids}
+            subset_hashes[name] = subset_hash(contents)
     is_complete = all(name in subset_hashes for name in HASHED_SUBSETS)
     whole_hash = None
     if is_complete:
@@ -242,33 +251,6 @@ def build_manifest(
         environments=tuple(environments),
         files=tuple(entries[scenario] for scenario in sorted(entries)),
     )
-
-
-def _collect_entries(
-    old: Manifest | None,
-    files: Iterable[FileEntry],
-    subsets: Mapping[str, Sequence[int]],
-) -> dict[int, FileEntry]:
-    """Return entries by id; old ones only if their subset still lists them."""
-    entries = {}
-    if old is not None:
-        for entry in old.files:
-            if entry.scenario in subsets.get(entry.subset, ()):
-                entries[entry.scenario] = entry
-    for entry in files:
-        entries[entry.scenario] = entry
-    return entries
-
-
-def _hash_complete_subsets(
-    entries: Mapping[int, FileEntry], subsets: Mapping[str, Sequence[int]]
-) -> dict[str, str]:
-    subset_hashes = {}
-    for name, ids in subsets.items():
-        if all(scenario in entries for scenario in ids):
-            contents = {scenario: entries[scenario].content_sha256 for scenario in ids}
-            subset_hashes[name] = subset_hash(contents)
-    return subset_hashes
 
 
 def merge_entries(

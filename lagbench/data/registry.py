@@ -12,10 +12,8 @@ from __future__ import annotations
 
 import functools
 import os
-import sys
 import warnings
-from collections.abc import Collection, Hashable, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -78,36 +76,15 @@ def package_of(point: EntryPoint) -> str:
 
 
 def suggest_split(name: str, known_names: Collection[str]) -> str:
-    """Return a hint for the name of a split that is not there.
-
-    >>> suggest_split("cavity,fluid", ["cavity", "fluid"])
-    'name one split in each command, as in --split cavity'
-    """
+    """Return a hint for the name of a split that is not there."""
     if name in SUBSETS:
         return f"that is a subset: name the split first, then subset={name!r}"
-    names = name.split(",")
-    if len(names) > 1 and set(names) <= {*known_names}:
-        return f"name one split in each command, as in --split {names[0]}"
     return suggest_name(name, known_names)
 
 
+@functools.cache
 def list_entry_points(group: str) -> tuple[EntryPoint, ...]:
-    """Return the entry points of a group, of the packages that are installed now.
-
-    Python reads the files of every package at each call. Here they are read again once
-    a folder on the path has changed, as it does where a package is installed or
-    removed.
-    """
-    modification_times = []
-    for folder in sys.path:
-        with suppress(OSError):
-            modified = os.stat(folder or os.curdir).st_mtime_ns
-            modification_times.append((folder, modified))
-    return _read_entry_points(group, tuple(modification_times))
-
-
-@functools.lru_cache(maxsize=8)
-def _read_entry_points(group: str, _: Hashable) -> tuple[EntryPoint, ...]:
+    """Return the entry points of a group, of the packages that are installed."""
     return tuple(entry_points(group=group))
 
 

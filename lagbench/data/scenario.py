@@ -10,7 +10,6 @@ import errno
 import json
 import math
 import os
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -23,23 +22,16 @@ from numpy.typing import NDArray
 
 from lagbench.errors import LIMIT_FIXES, DataError, LagbenchError, WorkFailedError
 
-from . import PARTICLE_KINDS
 from .checksums import ContentHasher
 from .hdf5 import (
     is_text,
     list_dimensions,
     list_variables,
     read_attribute,
-    read_attributes,
     to_plain,
 )
-from .layout import ScenarioKey, generation_command, has_file
-from .variables import (
-    ATTRIBUTES,
-    MAX_VALUES_PER_FRAME,
-    expected_attributes,
-    list_differing_attributes,
-)
+from .layout import ScenarioKey, generation_command
+from .variables import ATTRIBUTES, MAX_VALUES_PER_FRAME, require_known_material
 
 BLOCK_BYTES = 1 << 20
 """Files are streamed in pieces of about this size [bytes]."""
@@ -47,30 +39,8 @@ BLOCK_BYTES = 1 << 20
 CHUNK_CACHE = 1 << 20
 """Chunk cache of a variable [bytes]; netCDF's 64 MB would keep whole scenarios."""
 
-MAX_FACTS_LENGTH = 4096
-"""Characters of ``facts``, which no hash covers and the manifest repeats."""
-
 MOST_LETTERS = 80
 """Letters of a wrong attribute in a message."""
-
-MOST_ATTRIBUTES = 10
-"""Wrong attributes that a message names."""
-
-STATED_NAMES = frozenset(
-    (
-        "active_frames",
-        "friction",
-        "obstacle_diameter",
-        "obstacle_x",
-        "obstacle_y",
-        "obstacle_z",
-        "viscosity",
-    )
-)
-"""Parameters that lagbench or a user reads from the file, if the file states them."""
-
-_VERSION = re.compile(r"[0-9]{1,6}(?:\.[0-9]{1,6}){2}")
-_FACT_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +70,7 @@ class ScenarioHeader:
     def friction(self) -> float | None:
         """Coulomb friction of the walls that the file states [1]; None without one."""
         stated = self.parameters.get("friction")
-        return _parse_number(stated, "friction", unit="1", where=self._place)
+        return _parse_number(stated, "friction", where=self._place)
 
     @property
     def _place(self) -> str:
@@ -145,11 +115,11 @@ def parse_viscosity(stated: object, *, where: str) -> float | None:
     Raises:
         DataError: it is no finite number from 0.
     """
-    return _parse_number(stated, "viscosity", unit="length^2/s", where=where)
+    return _parse_number(stated, "viscosity", where=where)
 
 
-def _parse_number(stated: object, name: str, *, unit: str, where: str) -> float | None:
-    """Return a number from 0 in a file's attribute; None without one."""
+def _parse_number(stated: object, name: str, *, where: str) -> float | None:
+    """Return a number from 0 that a file states; None without one."""
     if stated is None:
         return None
     values = np.asarray(stated)
@@ -158,8 +128,7 @@ def _parse_number(stated: object, name: str, *, unit: str, where: str) -> float 
     if not 0.0 <= number < math.inf:
         raise DataError(
             f"the {name} has an impossible value: got {str(stated)[:MOST_LETTERS]}, "
-            f"expected a finite number from 0 [{unit}]; mend the attribute, or make "
-            "the file again",
+            "expected a finite number from 0; mend it, or make the file again",
             where=f"{where}, attribute {name}",
         )
     return number
@@ -261,37 +230,6 @@ class ScenarioFile:
                 block, where=str(self.path), fix=_repair_hint(self.path)
             )
 
-    def check_attributes(self) -> None:
-        """Refuse attributes that make other readers read other values."""
-        with _damage_errors(self.path):
-            names = read_attributes(self._file).keys()
-        unhashed = sorted((STATED_NAMES & names) - self.header.parameters.keys())
-        if unhashed:
-            raise DataError(
-                "the file states parameters that no hash covers: "
-                f"{', '.join(unhashed)}; {_repair_hint(self.path)}",
-                where=f"{self.path}, attributes",
-            )
-        for name, variable in sorted(self._variables.items()):
-            with _damage_errors(self.path, name):
-                attributes = read_attributes(variable)
-                dims = list_dimensions(variable, name)
-                meanings = str(attributes.get("flag_meanings", "")).split()
-                expected = expected_attributes(
-                    name, dims, has_wall_particles=PARTICLE_KINDS[-1] in meanings
-                )
-            differing = list_differing_attributes(expected, attributes)
-            if differing:
-                values = []
-                for key in differing[:MOST_ATTRIBUTES]:
-                    value = str(attributes.get(key, "missing"))
-                    values.append(f"{key} = {value}"[:MOST_LETTERS])
-                raise DataError(
-                    "attributes of a variable are not those of the format: "
-                    f"{', '.join(values)}; {_repair_hint(self.path)}",
-                    where=f"{self.path}, variable {name!r}",
-                )
-
     def stored_hashes(self) -> dict[str, object]:
         """Return the hash of each variable as the file states it."""
         hashes = {}
@@ -320,7 +258,7 @@ def read_scenario(path: Path) -> ScenarioFile:
     Raises:
         DataError: the file is missing, damaged, or no scenario, or it may not be read.
     """
-    if not has_file(path):
+    if not path.is_file():
         raise _missing_error(path, _repair_hint(path))
     with _damage_errors(path), ExitStack() as stack:
         file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
@@ -337,7 +275,7 @@ def rehash(path: Path) -> str:
 
 
 def check_scenario(path: Path, expected: str | None = None) -> str:
-    """Recompute a file's content hash, compare it, and check materials and attributes.
+    """Recompute a file's content hash, compare it, and check materials.
 
     Args:
         path: the scenario file.
@@ -347,14 +285,12 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
         The content hash.
 
     Raises:
-        DataError: a hash differs, a material is unknown, or the attributes are not
-            those of the format.
+        DataError: a hash differs, or a material is unknown.
     """
     with read_scenario(path) as file:
         stored_hashes = file.stored_hashes()
         stored_content_hash = file.header.content_sha256
         hasher = file.computed_hasher()
-        file.check_attributes()
         for name, variable_hash in hasher.digests().items():
             if stored_hashes.get(name) != variable_hash:
                 raise _hash_error(
@@ -411,13 +347,10 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
 def _read_header(
     file: h5py.File, variables: Mapping[str, h5py.Dataset]
 ) -> ScenarioHeader:
-    version = _require_text(file, "version")
-    if not _VERSION.fullmatch(version):
-        raise DataError(f"the attribute 'version' is {version[:40]!a}")
     key = ScenarioKey(
         split=_require_text(file, "split"),
         size=_require_text(file, "size"),
-        version=version,
+        version=_require_text(file, "version"),
         scenario=_require_integer(file, "scenario"),
         subset=_require_text(file, "subset"),
     )
@@ -434,7 +367,7 @@ def _read_header(
         device=_require_text(file, "device"),
         generator=_require_text(file, "generator"),
         lagbench_version=_require_text(file, "lagbench_version"),
-        facts=_read_facts(file),
+        facts=json.loads(str(read_attribute(file, "facts") or "{}")),
     )
 
 
@@ -454,24 +387,6 @@ def _require_integer(file: h5py.File, name: str) -> int:
 
 def _require_text(file: h5py.File, name: str) -> str:
     return str(_require_attribute(file, name))
-
-
-def _read_facts(file: h5py.File) -> dict[str, float]:
-    """Return the simulation diagnostics of a file: finite numbers by name."""
-    text = read_attribute(file, "facts")
-    if text is None:
-        return {}
-    if len(str(text)) > MAX_FACTS_LENGTH:
-        raise DataError("the attribute 'facts' is too long")
-    facts = {}
-    for name, stored_value in json.loads(str(text)).items():
-        value = float(stored_value)
-        if not _FACT_NAME.fullmatch(name) or not math.isfinite(value):
-            raise DataError(
-                "the attribute 'facts' holds something else than finite numbers by name"
-            )
-        facts[name] = value
-    return facts
 
 
 @contextmanager
@@ -536,26 +451,6 @@ def damage_error(
 
 def _missing_error(path: Path, fix: str) -> DataError:
     return DataError(f"a scenario file is missing; {fix}", where=str(path))
-
-
-def require_known_material(material: NDArray[Any], *, where: str, fix: str) -> None:
-    """Refuse numbers that stand for no material.
-
-    Args:
-        material: numbers of materials.
-        where: the file or scenario that has them, for the message.
-        fix: what to do about a wrong number.
-
-    Raises:
-        DataError: there is such a number.
-    """
-    is_known = np.isin(material, range(len(PARTICLE_KINDS)))
-    if not is_known.all():
-        raise DataError(
-            f"a particle has an unknown material: got {material[~is_known][0]}, "
-            f"expected whole numbers from 0 to {len(PARTICLE_KINDS) - 1}; {fix}",
-            where=f"{where}, variable 'material'",
-        )
 
 
 def _repair_hint(path: Path) -> str:

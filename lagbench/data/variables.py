@@ -9,20 +9,15 @@ Parameters of a scenario are attributes of the file. They do enter the hash.
 
 from __future__ import annotations
 
-import re
-import unicodedata
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.errors import DataError
 
 from . import MATERIALS, PARTICLE_KINDS
-from .hdf5 import HIDDEN_ATTRIBUTES, to_plain
-
-if TYPE_CHECKING:
-    pass
 
 ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
     "frame": {
@@ -62,13 +57,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
 }
 """Attributes of each variable beside ``coordinates`` and ``content_sha256``."""
 
-UNCHECKED_ATTRIBUTES = {"content_sha256", "long_name"}
-"""Attributes that a reader does not compare.
-
-The hash is checked elsewhere, and a patch release may reword a name.
-"""
-
-_RESERVED = {
+RESERVED = {
     "Conventions",
     "title",
     "source",
@@ -89,37 +78,6 @@ _RESERVED = {
     "periodic",
 }
 """Attributes of the file that no parameter may be named like."""
-
-_KEPT_BY_NETCDF = HIDDEN_ATTRIBUTES | {
-    "_ARRAY_DIMENSIONS",
-    "_Codecs",
-    "_Format",
-    "_IsNetcdf4",
-    "_SuperblockVersion",
-    "_nczarr_array",
-    "_nczarr_attr",
-    "_nczarr_group",
-    "_nczarr_superblock",
-}
-"""Attributes that netCDF and HDF5 keep for themselves."""
-
-LONGEST_NAME = 256
-"""Longest name of an attribute in netCDF [bytes]."""
-
-POSSIBLE_NAME = (
-    "letters, digits and _, as in disc_radius, and no name that files use; at most "
-    f"{LONGEST_NAME} bytes, in the composed form (NFC)"
-)
-"""What the name of a parameter has to be."""
-
-STORABLE_VALUE = (
-    "a finite number, a whole one of 64 bits at most, or a text that is not empty and "
-    "has no NUL and no lone surrogate"
-)
-"""What the value of a parameter has to be."""
-
-_SURROGATES = re.compile("[\ud800-\udfff]")
-"""Halves of characters, which no UTF-8 has."""
 
 MAX_VALUES_PER_FRAME = 20_000_000
 """Values of a variable in one frame, which is read at once.
@@ -142,56 +100,21 @@ def expected_attributes(
     return attributes
 
 
-def list_differing_attributes(
-    expected: Mapping[str, object], attributes: Mapping[str, object]
-) -> list[str]:
-    """Return the names of attributes that differ, sorted."""
-    names = (expected.keys() | attributes.keys()) - UNCHECKED_ATTRIBUTES
-    differing = []
-    for name in sorted(names):
-        if not _is_equal(expected.get(name), attributes.get(name)):
-            differing.append(name)
-    return differing
+def require_known_material(material: NDArray[Any], *, where: str, fix: str) -> None:
+    """Refuse numbers that stand for no material.
 
+    Args:
+        material: numbers of materials.
+        where: the file or scenario that has them, for the message.
+        fix: what to do about a wrong number.
 
-def _is_equal(expected: object, value: object) -> bool:
-    if not isinstance(expected, np.ndarray):
-        return isinstance(value, str) and expected == value
-    return (
-        isinstance(value, np.ndarray)
-        and expected.dtype == value.dtype
-        and np.array_equal(expected, value)
-    )
-
-
-def find_name_fault(name: str) -> str | None:
-    """Return why no parameter can have a name in a scenario file; None if one can."""
-    if not name.isidentifier():
-        return "no identifier"
-    if name in _RESERVED:
-        return "the name of an attribute that each file has"
-    if name in _KEPT_BY_NETCDF:
-        return "a name that netCDF keeps for itself"
-    if not unicodedata.is_normalized("NFC", name):
-        return "another form, which netCDF would change"
-    length = len(name.encode("utf-8"))
-    if length > LONGEST_NAME:
-        return f"{length} bytes"
-    return None
-
-
-def as_attribute(value: object) -> int | float | str | None:
-    """Return a value as an attribute holds it; None where netCDF cannot store it."""
-    try:
-        plain_value = to_plain(value)
-    except (DataError, UnicodeDecodeError):
-        return None
-    if isinstance(plain_value, int):
-        is_storable = -(2**63) <= plain_value < 2**64
-        return plain_value if is_storable else None
-    if isinstance(plain_value, str):
-        is_storable = plain_value != "" and not _SURROGATES.search(plain_value)
-        return plain_value if is_storable else None
-    if isinstance(plain_value, float):
-        return plain_value
-    return None
+    Raises:
+        DataError: there is such a number.
+    """
+    is_known = np.isin(material, range(len(PARTICLE_KINDS)))
+    if not is_known.all():
+        raise DataError(
+            f"a particle has an unknown material: got {material[~is_known][0]}, "
+            f"expected whole numbers from 0 to {len(PARTICLE_KINDS) - 1}; {fix}",
+            where=f"{where}, variable 'material'",
+        )

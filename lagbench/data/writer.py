@@ -29,19 +29,16 @@ from lagbench.errors import (
     WorkFailedError,
 )
 
-from . import PARTICLE_KINDS, WALL
+from . import WALL
 from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher
-from .field_errors import describe_value
-from .hdf5 import open_netcdf
+from .hdf5 import open_netcdf, to_plain
 from .layout import ScenarioKey
 from .variables import (
     MAX_VALUES_PER_FRAME,
-    POSSIBLE_NAME,
-    STORABLE_VALUE,
-    as_attribute,
+    RESERVED,
     expected_attributes,
-    find_name_fault,
+    require_known_material,
 )
 
 FORMAT = 1
@@ -151,46 +148,43 @@ class ScenarioWriter:
         self._lengths = {"frame": frames, "particle": particles, "space": dimension}
         # dimensions and values by name of the variable
         self._constants: dict[str, tuple[tuple[str, ...], NDArray[Any]]] = {}
-        self._add_constant("frame", ("frame",), np.arange(frames, dtype=np.int32))
-        times = np.arange(frames, dtype=np.float64) * frame_interval
-        self._add_constant("time", ("frame",), times)
-        numbers = np.arange(particles, dtype=np.int32)
-        self._add_constant("particle", ("particle",), numbers)
-        self._add_constant(
-            "space", ("space",), np.array(AXES[:dimension], dtype=object)
-        )
-        materials = _check_material(material, particles, path)
-        self._add_constant("material", ("particle",), materials)
-        mass = np.asarray(particle_mass, dtype=np.float64)
-        self._add_constant("particle_mass", (), mass)
+        materials = np.asarray(material)
+        if materials.shape != (particles,):
+            raise DataError(
+                f"the materials have the wrong shape: got {materials.shape}, expected "
+                f"{(particles,)}; give one number for each particle",
+                where=f"{path}, variable 'material'",
+            )
+        # before the cast, which wraps
+        fix = "give the numbers of lagbench.data.PARTICLE_KINDS"
+        require_known_material(materials, where=str(path), fix=fix)
+        numbers = np.arange(frames, dtype=np.int32)
+        self._constants |= {
+            "frame": (("frame",), numbers),
+            "time": (("frame",), numbers.astype(np.float64) * frame_interval),
+            "particle": (("particle",), np.arange(particles, dtype=np.int32)),
+            "space": (("space",), np.array(AXES[:dimension], dtype=object)),
+            "material": (("particle",), materials.astype(np.int8)),
+            "particle_mass": ((), np.asarray(particle_mass, dtype=np.float64)),
+        }
         if wall_velocity is not None:
-            self._add_walls(np.asarray(wall_velocity, np.float32))
+            wall_names = np.array(WALL_NAMES[: 2 * dimension], dtype=object)
+            self._lengths["wall"] = len(wall_names)
+            self._constants["wall"] = (("wall",), wall_names)
+            self._add_vectors("wall_velocity", "wall", wall_velocity)
         if body_force is not None:
-            self._add_force(np.asarray(body_force, np.float32))
+            self._lengths["layer"] = np.shape(body_force)[1]
+            self._add_vectors("body_force", "layer", body_force)
 
         self._hasher = ContentHasher(key.identity(seed, self._parameters))
         self._written_frames = 0
 
-    def _add_constant(
-        self, name: str, dims: tuple[str, ...], values: NDArray[Any]
-    ) -> None:
+    def _add_vectors(self, name: str, place: str, vectors: ArrayLike) -> None:
+        """Add constants of each frame and wall or layer."""
+        dims = ("frame", place, "space")
+        shape = [self._lengths[dim] for dim in dims]
+        values = np.broadcast_to(np.asarray(vectors, np.float32), shape)
         self._constants[name] = (dims, values)
-
-    def _add_walls(self, wall_velocity: NDArray[np.float32]) -> None:
-        dimension = self._lengths["space"]
-        wall_names = WALL_NAMES[: 2 * dimension]
-        self._lengths["wall"] = len(wall_names)
-        self._add_constant("wall", ("wall",), np.array(wall_names, dtype=object))
-        shape = (self._lengths["frame"], len(wall_names), dimension)
-        values = np.broadcast_to(wall_velocity, shape)
-        self._add_constant("wall_velocity", ("frame", "wall", "space"), values)
-
-    def _add_force(self, body_force: NDArray[np.float32]) -> None:
-        layer_count = body_force.shape[1]
-        self._lengths["layer"] = layer_count
-        shape = (self._lengths["frame"], layer_count, self._lengths["space"])
-        values = np.broadcast_to(body_force, shape)
-        self._add_constant("body_force", ("frame", "layer", "space"), values)
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the frames."""
@@ -199,21 +193,18 @@ class ScenarioWriter:
             temporary = stack.enter_context(atomic_path(self.path))
             self._file = open_netcdf(temporary, "w")
             stack.callback(self._file.close)
-            self._write_constants()
+            for dimension, length in self._lengths.items():
+                self._file.createDimension(dimension, length)
+            for name, (dims, values) in self._constants.items():
+                self._create(name, values.dtype, dims)
+                self._hasher.update(name, values)
+                self._file[name][...] = values
             for name in self._moving_names:
                 self._create(name, np.dtype(np.float32), ("frame", "particle", "space"))
             attributes = self._file_attributes(version("lagbench"))
             self._file.setncatts(attributes | self._parameter_attributes())
             self._stack = stack.pop_all()
         return self
-
-    def _write_constants(self) -> None:
-        for dimension, length in self._lengths.items():
-            self._file.createDimension(dimension, length)
-        for name, (dims, values) in self._constants.items():
-            self._create(name, values.dtype, dims)
-            self._hasher.update(name, values)
-            self._file[name][...] = values
 
     def _file_attributes(self, program_version: str) -> dict[str, object]:
         key = self.key
@@ -337,52 +328,19 @@ def _chunk_shape(
     return shape or None
 
 
-def _check_material(
-    material: ArrayLike, particles: int, path: Path
-) -> NDArray[np.int8]:
-    """Return the material of each particle; refuse other shapes and other numbers."""
-    numbers = np.asarray(material)
-    where = f"{path}, variable 'material'"
-    if numbers.shape != (particles,):
-        raise DataError(
-            f"the materials have the wrong shape: got {numbers.shape}, expected "
-            f"{(particles,)}; give one number for each particle",
-            where=where,
-        )
-    # before the cast, which wraps
-    is_known = np.isin(numbers, range(len(PARTICLE_KINDS)))
-    if not is_known.all():
-        raise DataError(
-            f"a particle has an unknown material: got {numbers[~is_known][0]}, "
-            f"expected whole numbers from 0 to {len(PARTICLE_KINDS) - 1}; give the "
-            "numbers of lagbench.data.PARTICLE_KINDS",
-            where=where,
-        )
-    return numbers.astype(np.int8)
-
-
 def _check_parameters(
     parameters: Mapping[str, object], path: Path
 ) -> dict[str, object]:
     """Return parameters as plain values; refuse reserved names and other values."""
     plain_values: dict[str, object] = {}
     for name, value in parameters.items():
-        fault = find_name_fault(name)
-        if fault is not None:
+        if not name.isidentifier() or name in RESERVED:
             raise DataError(
-                f"a parameter cannot be named {describe_value(name)}: got {fault}, "
-                f"expected {POSSIBLE_NAME}; rename the parameter",
+                f"no parameter can be named {name!r}; take letters, digits and _, and "
+                "no name that files use",
                 where=str(path),
             )
-        plain_value = as_attribute(value)
-        if plain_value is None:
-            raise DataError(
-                f"the parameter {name!r} cannot be stored: got "
-                f"{describe_value(value)}, expected {STORABLE_VALUE}; give such a "
-                "value, or leave the parameter out",
-                where=str(path),
-            )
-        plain_values[name] = plain_value
+        plain_values[name] = to_plain(value)
     return plain_values
 
 

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from lagbench.data import WALL
 from lagbench.data.box import AXES, Box
-from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
+from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.judgement import Judgement, find_shared_frames, judge_trajectory
 from lagbench.data.layout import expand_home
 from lagbench.errors import DataError, UsageError
@@ -131,7 +131,7 @@ def adopt(
     reading = Reading(axes=axes, positions=positions)
     if isinstance(sources, str | Path | xr.Dataset):
         sources = [sources]
-    listings, stated, text = _list_subsets(sources, reading, valid=valid, test=test)
+    listings, stated = _list_subsets(sources, reading, valid=valid, test=test)
     known_kinds = parse_kinds(kinds)
     description = _describe({**stated, **options})
     counts = {subset: len(listing.sources) for subset, listing in listings.items()}
@@ -166,7 +166,7 @@ def adopt(
         description,
         box,
         trajectories,
-        source=text or f"{total} trajectories of the user's own",
+        source=f"{total} trajectories of the user's own",
         count=partial(meter.count, 1, scenarios=1),
     )
     if counts["test"] < FEWEST_SCENARIOS:
@@ -183,8 +183,8 @@ def _list_subsets(
     *,
     valid: int | None,
     test: int | None,
-) -> tuple[dict[str, Listing], dict[str, Any], str]:
-    """Return the trajectories of each subset, what metadata state, and their source."""
+) -> tuple[dict[str, Listing], dict[str, Any]]:
+    """Return the trajectories of each subset, and what metadata state."""
     first = sources[0]
     if len(sources) == 1 and not isinstance(first, xr.Dataset):
         folder = expand_home(first, "sources")
@@ -200,16 +200,13 @@ def _list_subsets(
                     "--valid and --test out, and keep one file or folder of each name"
                 )
             listings = {}
-            digests = []
             for subset, (path,) in parts.items():
                 listings[subset] = list_sources(path, reading)
-                if path.is_file():
-                    digests.append(f"{path.name} {file_sha256(path)[:16]}")
             known = ["metadata.json", *(path.name for (path,) in parts.values())]
             for entry in sorted(folder.iterdir()):
                 if entry.name not in known and not entry.name.startswith("."):
                     listings["train"].skipped.append(entry.name)
-            return listings, read_metadata(folder), ", ".join(digests)
+            return listings, read_metadata(folder)
 
     found: list[Source] = []
     skipped: list[str] = []
@@ -240,7 +237,7 @@ def _list_subsets(
         members = found[ends[number] : ends[number + 1]]
         listings[subset] = Listing(sources=members)
     listings["train"].skipped.extend(skipped)
-    return listings, {}, ""
+    return listings, {}
 
 
 def _sources_of_dataset(dataset: xr.Dataset, name: str) -> Iterator[Source]:
@@ -301,7 +298,7 @@ def _judge(
             f"file, and --frame-interval is {interval:.6g} s; leave the option out, or "
             "correct the file"
         )
-    stated = _select_axes(_with_file_box(description, trajectory), trajectory)
+    stated = _state_box(description, trajectory)
     with closing(trajectory):
         is_wall = trajectory.material == WALL
         if is_wall.all():
@@ -361,15 +358,13 @@ def _drop_constant_axes(trajectory: Trajectory) -> Trajectory:
     )
 
 
-def _with_file_box(description: Description, trajectory: Trajectory) -> Description:
-    """Return a description with the box of the file where the user states none."""
-    if description.bounds is not None or not trajectory.stated.get("periodic"):
-        return description
-    return _describe({**description.model_dump(), **trajectory.stated})
+def _state_box(description: Description, trajectory: Trajectory) -> Description:
+    """Return a description with the bounds and periodic axes of the axes that are kept.
 
-
-def _select_axes(description: Description, trajectory: Trajectory) -> Description:
-    """Return a description whose bounds and periodic axes are those that are kept."""
+    They are the user's, else those of the file.
+    """
+    if description.bounds is None and trajectory.stated.get("periodic"):
+        description = _describe({**description.model_dump(), **trajectory.stated})
     axes = trajectory.axes
     bounds = description.bounds
     if bounds is None or len(bounds) == len(axes):

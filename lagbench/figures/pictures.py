@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagbench.atomic import check_output_file
-from lagbench.data.layout import expand_home, has_file
+from lagbench.data.layout import expand_home
 from lagbench.data.local import locate, suggest_repair
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.store.copy import update_working_copy
@@ -189,7 +189,7 @@ def find_scenario(
     tier.subset_of(scenario_id)  # refuses an id that the size does not have
     update_working_copy(tier, folder, [scenario_id])
     path = tier.path(folder, scenario_id)
-    if not has_file(path):
+    if not path.is_file():
         fix = suggest_repair(tier, repair, root=folder)
         raise DataError(f"scenario {scenario_id} is not there: no {path}; {fix}")
     return path

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lagbench.data.box import WALL_NAMES
-from lagbench.data.layout import has_file
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError
@@ -278,7 +277,7 @@ def draw_contact_sheet(
     files = []
     for ids in tier.subsets.values():
         paths = [tier.path(folder, scenario) for scenario in sorted(ids)]
-        files += [path for path in paths if has_file(path)]
+        files += [path for path in paths if path.is_file()]
     if not files:
         fix = suggest_repair(tier, root=folder)
         raise DataError(

@@ -16,11 +16,8 @@ from lagbench.data import grid as gridding
 from lagbench.data.box import parse_obstacle
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size
-from lagbench.data.scenario import (
-    ScenarioFile,
-    read_scenario,
-    require_known_material,
-)
+from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.data.variables import require_known_material
 from lagbench.errors import UsageError
 
 # folders between the root of all data sets and a scenario file

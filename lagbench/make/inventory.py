@@ -20,8 +20,6 @@ from lagbench.data.hdf5 import to_plain
 from lagbench.data.layout import (
     PICTURES,
     format_ids,
-    has_file,
-    refuse_closed_folder,
     scenario_path,
     url_of,
 )
@@ -97,9 +95,6 @@ class Overview:
 def overview(size: Size, root: Path) -> Overview:
     """Return what a size is, costs, and has below a root folder or in its store, read
     from names alone.
-
-    Raises:
-        ClosedFolderError: the folder of the data set may not be read.
     """
     folder = size.folder(root)
     ids = size.scenarios
@@ -109,7 +104,7 @@ def overview(size: Size, root: Path) -> Overview:
         seconds = estimate(size, ids).core_seconds / available_cores()
     url = url_of(root)
     if url is None:
-        present_ids = {i for i in ids if has_file(size.path(root, i))}
+        present_ids = {i for i in ids if size.path(root, i).is_file()}
     else:
         # what a store takes is not loaded for a folder
         from lagbench.store.copy import remote_manifest
@@ -122,7 +117,7 @@ def overview(size: Size, root: Path) -> Overview:
     for subset, members in size.subsets.items():
         counts[subset] = len(members)
         present[subset] = len(present_ids.intersection(members))
-    pictures = [folder / name for name in PICTURES if has_file(folder / name)]
+    pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
     return Overview(
         split=size.split,
         size=size.name,
@@ -177,12 +172,8 @@ def inspect_scenario(
         manifest: what the folder's manifest says.
         quick: ask for a manifest entry, and take the content hash that this machine
             noted before instead of hashing the values again.
-
-    Raises:
-        ClosedFolderError: the folder of the file may not be read.
     """
     path = scenario_path(root, size.key(scenario))
-    refuse_closed_folder(path)
     if not path.exists():
         return ScenarioInspection(scenario=scenario, state=DataSetState.MISSING)
     try:
@@ -232,8 +223,6 @@ def _inspect_file(
                 where=str(path),
             )
         different_parameters = _list_different_parameters(file.header, size, scenario)
-        if noted_content and not different_parameters:
-            file.check_attributes()
     recorded = recorded_hash(size, scenario)
     content = noted_content
     if different_parameters:

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.layout import has_file
 from lagbench.data.local import check_contents
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import UsageError, suggest_name
@@ -62,7 +61,7 @@ def check_train(size: Size, root: Path, references: Collection[str]) -> None:
 def _has_files(size: Size, root: Path, subset: str) -> bool:
     """Return whether all files of a subset, which is not empty, are there."""
     ids = size.subsets.get(subset, ())
-    return bool(ids) and all(has_file(size.path(root, i)) for i in ids)
+    return bool(ids) and all(size.path(root, i).is_file() for i in ids)
 
 
 def sizes_with_test_files(

@@ -26,7 +26,6 @@ from lagbench.data.layout import (
     CARD_NAME,
     MANIFEST_NAME,
     format_ids,
-    has_file,
     url_of,
 )
 from lagbench.data.local import suggest_repair
@@ -129,7 +128,7 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
 
     missing = []
     for scenario, path in paths.items():
-        if not has_file(path):
+        if not path.is_file():
             missing.append(scenario)
     if missing:
         incomplete_subsets = []
@@ -251,7 +250,7 @@ def is_in_copy(
     The bytes are hashed, unless the trusted manifest has the same entry.
     """
     path = size.folder(root) / entry.path
-    if not has_file(path) or path.stat().st_size != entry.bytes:
+    if not path.is_file() or path.stat().st_size != entry.bytes:
         return False
     if trusted is not None:
         trusted_entry = trusted.entry(entry.scenario)

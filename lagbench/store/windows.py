@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import parse_obstacle
 from lagbench.data.hdf5 import list_variables
-from lagbench.data.layout import has_file, major_of
+from lagbench.data.layout import major_of
 from lagbench.data.local import check_contents, locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import (
@@ -142,7 +142,7 @@ class FrameStore:
     def _open_checked(self, scenario: int) -> ScenarioHandle:
         """Open a file; refuse one of another scenario, version or content."""
         path = self._paths[scenario]
-        if not has_file(path):
+        if not path.is_file():
             raise DataError(
                 f"a scenario file is missing; {self._repair_hint(scenario)}",
                 where=str(path),

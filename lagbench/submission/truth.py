@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.data.layout import format_ids, has_file
+from lagbench.data.layout import format_ids
 from lagbench.data.local import check_contents, suggest_repair
 from lagbench.data.manifest import read_or_empty
 from lagbench.data.registry import Size
@@ -68,10 +68,9 @@ class Truth:
 
         Raises:
             DataError: scenarios are missing.
-            ClosedFolderError: their folder may not be read.
         """
         scenarios = self.size.subsets[self.subset]
-        missing = [i for i in scenarios if not has_file(self.path(i))]
+        missing = [i for i in scenarios if not self.path(i).is_file()]
         if missing:
             raise DataError(
                 f"{len(missing)} of {len(scenarios)} {self.subset} scenarios are not "

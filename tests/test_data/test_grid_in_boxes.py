@@ -15,7 +15,6 @@ from lagbench.data.grid import (
     differentiable_nodes,
     divergence,
     fields,
-    scatter_in_box,
     slope_along,
     transfer,
     vorticity,
@@ -97,22 +96,6 @@ def test_a_constant_velocity_stays_constant_and_full(
         component_of_nodes = result.velocity[..., axis]
         nodes = inner(component_of_nodes, box, 2)
         assert_allclose(nodes, component, rtol=1e-12)
-
-
-@EVERY_PLACEMENT
-def test_both_scatters_agree_between_walls(placement: Placement) -> None:
-    rng = np.random.default_rng(0)
-    grid = Grid(11, placement)
-    x = rng.uniform(-0.05, 1.05, (500, 2))
-    x[3] = np.nan
-    u = rng.standard_normal((500, 2))
-    fast = transfer(x, u, grid)
-    sums = np.empty((3, *grid.shape))
-    scatter_in_box(x, u, grid, sums)
-    weight, *_ = sums
-    assert_allclose(weight, fast.weight, atol=1e-12)
-    momentum = np.moveaxis(sums[1:], 0, -1)
-    assert_allclose(momentum, fast.momentum, atol=1e-12)
 
 
 @EVERY_PERIODIC_BOX

@@ -31,7 +31,6 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "dam_break" / "dam_b
 SOURCE = (EXAMPLE / "__init__.py").read_text()
 
 WIDTH = "uniform(rng, 0.2, 0.4)"
-HEIGHT = '"height": height'
 CONSTANTS = "constants(FreeSurfaceParameters, size)"
 
 
@@ -119,34 +118,6 @@ def test_a_scenario_of_one_frame_is_its_initial_state(
     assert facts["max_speed"] == 0.0
     assert facts["jacobian_min"] == 1.0
     assert facts["jacobian_max"] == 1.0
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (HEIGHT, '"height": None'),
-        (HEIGHT, '"height": np.ones(3)'),
-        (HEIGHT, '"height": ""'),
-        (HEIGHT, '"height": True'),
-        (HEIGHT, '"height": np.True_'),
-        (HEIGHT, '"height": 2**64'),
-        (HEIGHT, '"height": 10**400'),
-        (HEIGHT, r'"height": "a\0b"'),
-        (HEIGHT, r'"height": "\udc80"'),
-        (HEIGHT, '"the height": height'),
-        (HEIGHT, '300 * "h": height'),
-        (HEIGHT, '"seed": 7'),
-        (HEIGHT, '"CLASS": 7'),
-        (HEIGHT, r'"n\u0303": 7'),
-    ],
-)
-def test_a_value_that_cannot_be_stored_is_refused_as_it_is_drawn(
-    old: str, new: str, package: Install
-) -> None:
-    size, _ = own_size(package, old, new)
-    with pytest.raises(UsageError) as caught:
-        draw_initial_state(size, 3)
-    assert str(caught.value.where).startswith("mine.initial_state, scenario 3")
 
 
 def test_parameters_of_our_own_splits_are_blamed_on_the_registry(
