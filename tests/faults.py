@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import os
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -225,25 +224,6 @@ def _replaced(value: Any) -> Callable[[h5py.File], object]:
     return change
 
 
-def _filtered(code: int, variable: str) -> Callable[[h5py.File], object]:
-    """Return what passes a variable through a filter twice."""
-
-    def change(file: h5py.File) -> None:
-        shape, kind = SHAPE, h5py.h5t.IEEE_F32LE
-        if variable == "scenario":
-            shape, kind = (3,), h5py.h5t.STD_I32LE
-        plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        plist.set_chunk(shape)
-        values = (9,) if code == h5py.h5z.FILTER_DEFLATE else ()
-        for _ in range(2):
-            plist.set_filter(code, h5py.h5z.FLAG_OPTIONAL, values)
-        del file[variable]
-        space = h5py.h5s.create_simple(shape)
-        h5py.h5d.create(file.id, variable.encode(), kind, space, plist)
-
-    return change
-
-
 def _external_storage(file: h5py.File) -> None:
     outside = [("/etc/passwd", 0, h5py.h5f.UNLIMITED)]
     replace(file, "position", DIMS, shape=SHAPE, dtype="f4", external=outside)
@@ -259,15 +239,6 @@ def _virtual(file: h5py.File) -> None:
 def _many_groups(file: h5py.File) -> None:
     for number in range(1200):
         file.create_group(f"g{number}")
-
-
-def _bomb(file: h5py.File) -> None:
-    """Store a chunk of 768 bytes whose zlib stream unpacks to 2 GiB."""
-    packer = zlib.compressobj(9)
-    zeros = bytes(1 << 24)
-    first = packer.compress(zeros) + packer.flush(zlib.Z_FULL_FLUSH)
-    more = packer.compress(zeros) + packer.flush(zlib.Z_FULL_FLUSH)
-    file["position"].id.write_direct_chunk((1, 1, 0, 0), first + 127 * more)
 
 
 def _many_frames(file: h5py.File) -> None:
@@ -295,7 +266,6 @@ ATTRIBUTES: dict[str, tuple[str, Any]] = {
     "method_is_a_number": ("method", 5),
     "method_is_a_list": ("method", np.array(["a", "b"], h5py.string_dtype())),
     "long_method": ("method", "x" * 10_000),
-    "method_as_bad_utf8": ("method", np.bytes_(b"\xff\xfe")),
     "method_is_empty": ("method", h5py.Empty("S1")),
     "seconds_negative": ("seconds_per_frame", -1.0),
     "seconds_nan": ("seconds_per_frame", np.nan),
@@ -326,29 +296,17 @@ register_changes(
             {"notes": h5py.ExternalLink("elsewhere.nc", "/position")}
         ),
         "too_many_groups": _many_groups,
-        "lzf_filter": lambda file: store(file, positions(file), compression="lzf"),
-        "deflated_twice": _filtered(h5py.h5z.FILTER_DEFLATE, "position"),
-        "shuffled_twice": _filtered(h5py.h5z.FILTER_SHUFFLE, "position"),
-        "ids_deflated_twice": _filtered(h5py.h5z.FILTER_DEFLATE, "scenario"),
-        "unknown_filter": _filtered(511, "position"),
         "no_scenario_ids": lambda file: file.pop("scenario"),
-        "tiny_chunks": lambda file: replace(
-            *(file, "position", DIMS),
-            shape=(3, 8, 5000, 2),
-            chunks=(1, 1, 1, 1),
-            dtype="f4",
-        ),
-        "huge_chunk": lambda file: replace(
-            *(file, "position", DIMS),
-            shape=SHAPE,
-            maxshape=(None,) * 4,
-            chunks=(3, 8, 1 << 20, 8),
-            dtype="f4",
-        ),
         "external_storage": _external_storage,
         "virtual_dataset": _virtual,
-        "small_chunk_bomb": _bomb,
         "two_billion_frames": _many_frames,
+        "two_billion_particles": lambda file: replace(
+            *(file, "position", DIMS),
+            shape=(3, 8, 1 << 31, 2),
+            chunks=(1, 1, 1 << 22, 2),
+            dtype="f4",
+            compression=1,
+        ),
     },
 )
 
@@ -412,13 +370,6 @@ register_changes(
     "particles",
     {
         "wrong_split": attribute("split", "curl-noise"),
-        "two_billion_particles": lambda file: replace(
-            *(file, "position", DIMS),
-            shape=(3, 8, 1 << 31, 2),
-            chunks=(1, 1, 1 << 22, 2),
-            dtype="f4",
-            compression=1,
-        ),
     },
 )
 

@@ -34,7 +34,7 @@ def read_single_value(owner: h5py.HLObject, name: str) -> object:
 class ArrayInfo:
     """A data set as its header describes it."""
 
-    shape: tuple[int, ...] | None  # None for one value, and for what must not be read
+    shape: tuple[int, ...] | None  # None for what must not be read
     dims: tuple[str, ...]  # an empty name where a dimension has none
     kind: str  # its type, such as "float32", without the byte order
     chunks: tuple[int, ...] | None
@@ -45,18 +45,16 @@ class ArrayInfo:
 def describe_array(dataset: h5py.Dataset) -> ArrayInfo:
     """Return what the header of a data set says."""
     issue = find_storage_issue(dataset)
-    if issue is not None:
-        return ArrayInfo(
-            shape=None, dims=(), kind="", chunks=None, chunk_bytes=0, issue=issue
-        )
+    if issue is None and not dataset.shape:
+        issue = "there is one value, or none"
     chunks = dataset.chunks
     return ArrayInfo(
-        shape=dataset.shape or None,
-        dims=read_dimensions(dataset),
+        shape=None if issue else dataset.shape,
+        dims=() if issue else read_dimensions(dataset),
         kind=dataset.dtype.name,
         chunks=chunks,
         chunk_bytes=dataset.dtype.itemsize * math.prod(chunks) if chunks else 0,
-        issue=None,
+        issue=issue,
     )
 
 

@@ -39,15 +39,6 @@ def _virtual(file: h5py.File) -> None:
     file.create_virtual_dataset("value", layout)
 
 
-def _pack_twice(file: h5py.File) -> None:
-    plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    plist.set_chunk((64,))
-    plist.set_deflate(9)
-    plist.set_deflate(9)
-    space = h5py.h5s.create_simple((64,))
-    h5py.h5d.create(file.id, b"twice", h5py.h5t.NATIVE_FLOAT, space, plist)
-
-
 HOSTILE: dict[str, Callable[[h5py.File], object]] = {
     "external link": lambda file: _link(file, h5py.ExternalLink("secret", "/film")),
     "soft link": lambda file: _link(file, h5py.SoftLink("/measured")),
@@ -56,9 +47,7 @@ HOSTILE: dict[str, Callable[[h5py.File], object]] = {
     "bomb": lambda file: file.create_dataset(
         "bomb", (1 << 30,), "f4", compression="gzip", chunks=(1 << 20,)
     ),
-    "extra group": lambda file: file.create_group("more"),
     "strings": lambda file: _replace(file, dtype=h5py.string_dtype()),
-    "packed twice": _pack_twice,
     "infinite": lambda file: file["value"].write_direct(
         np.full(file["value"].shape, np.inf, np.float32)
     ),
