@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from lagbench.data import WALLS
 
-from .constants import constants, interval, shift_number
+from .constants import constants, interval, shift_number, start_frame
 from .draws import (
     RandomSource,
     choice,
@@ -142,12 +142,6 @@ def _belt(size: Size, scenario: int) -> tuple[str, str] | None:
 def _driven_walls(size: Size, scenario: int) -> tuple[str, ...]:
     """Return the walls that move."""
     return _belt(size, scenario) or DRIVEN[scenario % len(DRIVEN)]
-
-
-def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
-    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
-    del scenario  # the same range for all
-    return draw_integer(rng, *interval(size, "start_frame"))
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:

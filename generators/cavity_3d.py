@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import WALL_NAMES
 
-from .constants import constants, interval
+from .constants import constants, interval, start_frame
 from .decaying_vortices import particles_per_side
-from .draws import RandomSource, draw_integer, draw_program, log_uniform
+from .draws import RandomSource, draw_program, log_uniform
 from .full_box_parameters import FullBoxParameters
 from .periodic_noise import fill_box
 from .split import InitialState, liquid
@@ -52,12 +52,6 @@ DRIVEN = (
 def solver_parameters(size: Size) -> FullBoxParameters:
     """Return the solver's constants at this size; walls hold the fluid."""
     return constants(FullBoxParameters, size, box=size.box, no_slip=True)
-
-
-def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
-    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
-    del scenario  # the same range for all
-    return draw_integer(rng, *interval(size, "start_frame"))
 
 
 def _draw_motion(

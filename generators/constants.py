@@ -23,7 +23,7 @@ from lagbench.errors import (
     find_place_in_extension,
 )
 
-from .draws import RandomSource, uniform
+from .draws import RandomSource, draw_integer, uniform
 from .full_box_parameters import FullBoxParameters
 from .shapes import Region
 from .solver import IMPLEMENTATIONS
@@ -47,6 +47,7 @@ __all__ = [
     "shift_number",
     "solver_constants",
     "split_module",
+    "start_frame",
 ]
 
 
@@ -221,6 +222,12 @@ def draw_between(rng: RandomSource, size: Size, name: str) -> float:
     """Draw uniformly between the parameters ``<name>_min`` and ``<name>_max``."""
     low, high = interval(size, name)
     return uniform(rng, low, high)
+
+
+def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
+    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
+    del scenario  # the same range for all
+    return draw_integer(rng, *interval(size, "start_frame"))
 
 
 def shift_number(size: Size, scenario: int) -> int | None:

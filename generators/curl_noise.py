@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError
 
 from .constants import constants, shift_number
-from .draws import RandomSource, fill_grid, quantise
+from .draws import RandomSource, quantise, square_sum
 from .full_box_parameters import FullBoxParameters
-from .noise import Jet, coordinates, gradients, noise, ramp
+from .noise import gradients, noise, ramp
+from .periodic_noise import Smooth, coordinate, fill_box, rotated_gradient
 from .split import InitialState, liquid
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def stream_function(
     low: float,
     high: float,
     scale: float,
-) -> Jet:
+) -> Smooth:
     """Return psi [length^2/s] and its derivatives at points between the walls.
 
     Args:
@@ -61,66 +62,26 @@ def stream_function(
         low: coordinate of the left and bottom walls [length].
         high: coordinate of the right and top walls [length].
         scale: s [length/s].
-
-    The velocity is u = psi.y and v = -psi.x.
     """
     width = high - low
     per_length = float(len(lattice) - 1) / width
-    x, y = coordinates(position)
-    minus_x = x.scale(-1.0)
-    minus_y = y.scale(-1.0)
-    # distances from the walls, in cells of the lattice at last; measured from its own
-    # wall, the ramp is exactly 0 there
-    left_distance = x.shift(-low)
-    bottom_distance = y.shift(-low)
-    right_distance = minus_x.shift(high)
-    top_distance = minus_y.shift(high)
-    from_left = left_distance.scale(per_length)
-    from_bottom = bottom_distance.scale(per_length)
-    from_right = right_distance.scale(per_length)
-    from_top = top_distance.scale(per_length)
+    # distances from the walls, in cells of the lattice; measured from its own wall, the
+    # ramp is exactly 0 there
+    from_low = []
+    from_high = []
+    for axis in range(2):
+        along = coordinate(position[:, axis], axis, 2)
+        from_low.append(along.shift(-low).scale(per_length))
+        from_high.append(along.scale(-1.0).shift(high).scale(per_length))
 
-    psi = noise(from_left, from_bottom, lattice)
-    for distance in (from_left, from_bottom, from_right, from_top):
-        half_cells = distance.scale(2.0)
-        window = ramp(half_cells)
-        psi = psi * window
-    amplitude = scale * width
-    return psi.scale(amplitude)
-
-
-def _pairs(x: Array, y: Array) -> Array:
-    """Return vectors from their components, shape [point, 2]."""
-    return np.stack([x, y], axis=-1)
-
-
-def flow(psi: Jet) -> tuple[Array, Array]:
-    """Return velocity [point, 2] and its gradient C [point, 2, 2], multiples of
-    2^-20.
-    """
-    u = psi.y
-    v = -psi.x
-    u_x = psi.xy
-    u_y = psi.yy
-    v_x = -psi.xx
-    v_y = -psi.xy
-    velocity = _pairs(u, v)
-    gradient_of_u = _pairs(u_x, u_y)
-    gradient_of_v = _pairs(v_x, v_y)
-    affine = np.stack([gradient_of_u, gradient_of_v], axis=1)
-    return quantise(velocity), quantise(affine)
+    psi = noise(*from_low, lattice)
+    for distance in (*from_low, *from_high):
+        psi = psi * ramp(distance.scale(2.0))
+    return psi.scale(scale * width)
 
 
 def _root_mean_square(values: Array) -> float:
-    square_sum = _sum_of_squares(values)
-    return math.sqrt(square_sum / values.size)
-
-
-def _sum_of_squares(values: Array) -> float:
-    """Return the sum of squares, rounded once."""
-    flat = values.ravel()
-    squares = [value * value for value in flat.tolist()]
-    return math.fsum(squares)
+    return math.sqrt(square_sum(values) / values.size)
 
 
 def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]:
@@ -133,16 +94,9 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     low, high = size.bounds[0]
     parameters = solver_parameters(size)
     node = (parameters.origin[0] + 1.0 + np.arange(parameters.cells[0])) / size.grid
-    node_count = len(node)
-    grid_x, grid_y = np.meshgrid(node, node, indexing="ij")
-    x = grid_x.ravel()
-    y = grid_y.ravel()
-    points = _pairs(x, y)
-
+    points = np.stack(np.meshgrid(node, node, indexing="ij"), axis=-1).reshape(-1, 2)
     psi = stream_function(points, lattice, low=low, high=high, scale=scale)
-    grid_shape = (node_count, node_count)
-    u = psi.y.reshape(grid_shape)
-    v = -psi.x.reshape(grid_shape)
+    u, v = rotated_gradient(psi).velocity.T.reshape(2, len(node), len(node))
 
     # neighbours of the inner nodes
     inner = slice(1, -1)
@@ -155,9 +109,7 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     per_difference = 0.5 * size.grid  # slope for a difference over two cells
     divergence = (u[east] - u[west] + v[north] - v[south]) * per_difference
     vorticity = (v[east] - v[west] - u[north] + u[south]) * per_difference
-    divergence_rms = _root_mean_square(divergence)
-    vorticity_rms = _root_mean_square(vorticity)
-    return divergence_rms, vorticity_rms
+    return _root_mean_square(divergence), _root_mean_square(vorticity)
 
 
 def _scale_of(size: Size, frequency: int) -> float:
@@ -181,13 +133,6 @@ def _frequency(size: Size, scenario: int) -> int:
     return int(size.value("frequency_shift_high"))
 
 
-def _viscosity(size: Size) -> float:
-    """Return nu [length^2/s]; 0 where the size states none."""
-    if "viscosity" not in size.parameters:
-        return 0.0
-    return float(size.value("viscosity"))
-
-
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw a jittered grid of particles and a random stream function that moves them.
 
@@ -205,12 +150,11 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
             "split",
             where=f"datasets.yaml, {size.split} {size.name}",
         )
-    position = fill_grid(
+    position = fill_box(
         rng,
-        columns,
-        rows,
-        low=low,
-        high=high,
+        (columns, rows),
+        low=(low, low),
+        high=(high, high),
         jitter=size.value("jitter"),
         subdivision=size.subdivision,
     )
@@ -219,22 +163,24 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     scale = _scale_of(size, frequency)
 
     psi = stream_function(position, lattice, low=low, high=high, scale=scale)
-    velocity, affine = flow(psi)
+    flow = rotated_gradient(psi)
+    velocity = quantise(flow.velocity)
     divergence, vorticity = _grid_rates(lattice, size, scale)
-    square_sum = _sum_of_squares(velocity)
-    energy = 0.5 * square_sum / size.particles
     width = high - low
+    viscosity = 0.0
+    if "viscosity" in size.parameters:
+        viscosity = float(size.value("viscosity"))
     return InitialState(
         position=position,
         velocity=velocity,
-        affine=affine,
+        affine=quantise(flow.affine),
         material=liquid(size.particles),
         area=width * width,
-        viscosity=_viscosity(size),
+        viscosity=viscosity,
         parameters={
             "frequency": frequency,
             "scale": scale,
-            "initial_kinetic_energy": energy,
+            "initial_kinetic_energy": 0.5 * square_sum(velocity) / size.particles,
             "initial_divergence_rms": divergence,
             "initial_vorticity_rms": vorticity,
         },

@@ -17,6 +17,7 @@ faster than in two dimensions; rings meet, and break where they do.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,20 +25,19 @@ from numpy.typing import NDArray
 
 from .constants import constants, draw_between, interval
 from .decaying_vortices import kinetic_energy, particles_per_side
-from .draws import RandomSource, log_uniform
+from .draws import RandomSource, draw_direction, log_uniform
 from .full_box_parameters import FullBoxParameters
 from .periodic_noise import (
     Flow,
     Smooth,
-    constant,
     coordinate,
     curl,
-    draw_direction,
     draw_lattice,
     fill_box,
     noise,
     scaled_to,
     wrapped_offset,
+    zero,
 )
 from .split import InitialState, liquid
 
@@ -67,7 +67,7 @@ def has_rings(scenario: int) -> bool:
 
 
 def ring_potential(
-    position: Array, *, centre: Array, normal: Array, radius: float
+    position: Array, *, centre: Array, normal: Sequence[float], radius: float
 ) -> tuple[Smooth, Smooth, Smooth]:
     """Return the vector potential of a ring, with s = 1.
 
@@ -82,27 +82,22 @@ def ring_potential(
     y = coordinate(offset[:, 1], 1, 3)
     z = coordinate(offset[:, 2], 2, 3)
     square = x * x + y * y + z * z
-    radius_square = radius * radius
-    minus_q = square.scale(-1.0 / radius_square)
-    one_minus_q = minus_q.shift(1.0)
-    is_inside = one_minus_q.value > 0.0
-    inside = one_minus_q.only_where(is_inside)
+    one_minus_q = square.scale(-1.0 / (radius * radius)).shift(1.0)
+    inside = one_minus_q.only_where(one_minus_q.value > 0.0)
     square_inside = inside * inside
     strength = square_inside * square_inside
     # the cross product of the normal and the way from the centre
     n_x, n_y, n_z = normal
-    crossed_x = z.scale(n_y) + y.scale(-n_z)
-    crossed_y = x.scale(n_z) + z.scale(-n_x)
-    crossed_z = y.scale(n_x) + x.scale(-n_y)
-    potential_x = strength * crossed_x
-    potential_y = strength * crossed_y
-    potential_z = strength * crossed_z
-    return potential_x, potential_y, potential_z
+    return (
+        strength * (z.scale(n_y) + y.scale(-n_z)),
+        strength * (x.scale(n_z) + z.scale(-n_x)),
+        strength * (y.scale(n_x) + x.scale(-n_y)),
+    )
 
 
 def draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
     """Draw the rings of a scenario."""
-    potential = [constant(0.0, len(position), 3) for _ in range(3)]
+    potential = [zero(len(position), 3) for _ in range(3)]
     for _ in range(size.value("ring_count")):
         centre = rng.random((3,))
         normal = draw_direction(rng, 3)

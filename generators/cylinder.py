@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .constants import constants, interval
-from .draws import RandomSource, choice, draw_integer, log_uniform, quantise, uniform
+from .constants import constants, interval, start_frame
+from .draws import RandomSource, choice, log_uniform, quantise, uniform
 from .full_box_parameters import FullBoxParameters
 from .obstacle import Obstacle, is_inside
 from .periodic_noise import fill_box
@@ -55,13 +55,6 @@ def solver_parameters(size: Size) -> FullBoxParameters:
         particles=is_solid.size - solid_count,
         obstacle_particles=solid_count,
     )
-
-
-def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
-    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
-    del scenario  # the same range for all
-    least, most = interval(size, "start_frame")
-    return draw_integer(rng, least, most)
 
 
 def lattice_counts(size: Size) -> tuple[int, int]:

@@ -224,28 +224,19 @@ def draw_integer(rng: RandomSource, low: float, high: float) -> int:
     return first + choice(rng, count)
 
 
-def direction(rng: RandomSource) -> tuple[float, float]:
-    """Draw a unit vector, uniform over the circle, without sine or cosine."""
-    # until a point of the square lies in the unit disc, and not at its very centre
+def draw_direction(rng: RandomSource, dimension: int) -> tuple[float, ...]:
+    """Draw a unit vector, uniform over the circle or sphere, without sine or cosine."""
+    # until a point of the cube lies in the unit ball, and not at its very centre
     while True:
-        unit_x, unit_y = rng.random((2,))
-        x = float(2.0 * unit_x - 1.0)
-        y = float(2.0 * unit_y - 1.0)
-        square = x * x + y * y
+        vector = 2.0 * rng.random((dimension,)) - 1.0
+        square = square_sum(vector)
         if 2.0**-20 <= square <= 1.0:
-            length = math.sqrt(square)
-            return x / length, y / length
+            return tuple((vector / math.sqrt(square)).tolist())
 
 
-def direction_in_space(rng: RandomSource) -> tuple[float, float, float]:
-    """Draw a unit vector, uniform over the sphere, as :func:`direction` does."""
-    while True:
-        unit = rng.random((3,))
-        x, y, z = (2.0 * unit - 1.0).tolist()
-        square = x * x + y * y + z * z
-        if 2.0**-20 <= square <= 1.0:
-            length = math.sqrt(square)
-            return x / length, y / length, z / length
+def square_sum(values: Array) -> float:
+    """Return the sum of the squares of all numbers, rounded once."""
+    return math.fsum([number * number for number in values.ravel().tolist()])
 
 
 def draw_program(
@@ -314,67 +305,16 @@ def fill(
         Positions [length], multiples of 2^-20, shape [particle, 2].
     """
     columns = math.isqrt(count)
-    ends = []
-    for column in range(columns + 1):
-        end = count * column // columns
-        ends.append(end)
-    return _fill_columns(
-        rng,
-        np.array(ends),
-        low=low,
-        high=high,
-        jitter=jitter,
-        subdivision=subdivision,
-    )
-
-
-def fill_grid(
-    rng: RandomSource,
-    columns: int,
-    rows: int,
-    *,
-    low: float,
-    high: float,
-    jitter: float,
-    subdivision: int = 1,
-) -> Array:
-    """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
-    ends = rows * np.arange(columns + 1)
-    return _fill_columns(
-        rng, ends, low=low, high=high, jitter=jitter, subdivision=subdivision
-    )
-
-
-def _fill_columns(
-    rng: RandomSource,
-    ends: NDArray[np.integer],
-    *,
-    low: float,
-    high: float,
-    jitter: float,
-    subdivision: int,
-) -> Array:
-    """Put particles near the middles of their cells, column by column.
-
-    Each is (r - 1/2) jitter spacings off. ``ends`` counts the particles before each
-    column, and all of them last; shape [column + 1].
-    """
+    ends = count * np.arange(columns + 1) // columns
     column_sizes = np.diff(ends)
-    column_count = len(column_sizes)
     # column and row of each particle's cell, shape [particle]
-    starts = ends[:-1]
-    column = np.repeat(np.arange(column_count), column_sizes)
-    particle_count = len(column)
-    row = np.arange(particle_count) - np.repeat(starts, column_sizes)
+    column = np.repeat(np.arange(columns), column_sizes)
+    row = np.arange(count) - np.repeat(ends[:-1], column_sizes)
     cell = np.stack([column, row], axis=-1)
     # cells across the square each way, shape [particle, 2]
-    columns_across = np.full(particle_count, column_count)
     rows_across = np.repeat(column_sizes, column_sizes)
-    cell_counts = np.stack([columns_across, rows_across], axis=-1)
+    cell_counts = np.stack([np.full(count, columns), rows_across], axis=-1)
 
     centred = draw_offsets(rng, cell.shape, subdivision=subdivision)
-    displacement = centred * jitter
-    middle = cell + 0.5
-    place = middle + displacement  # [cells]
-    from_corner = (high - low) * place / cell_counts
-    return quantise(low + from_corner)
+    place = cell + 0.5 + centred * jitter  # [cells]
+    return quantise(low + (high - low) * place / cell_counts)

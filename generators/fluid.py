@@ -25,7 +25,7 @@ from .constants import (
     ranges,
     shift_number,
 )
-from .draws import RandomSource, choice, direction, normal, quantise, uniform
+from .draws import RandomSource, choice, draw_direction, normal, quantise, uniform
 from .shapes import (
     Blobs,
     Body,
@@ -83,7 +83,7 @@ def _draw_blobs(rng: RandomSource, area: float, size: Size) -> Blobs:
     centres = []
     for _ in range(size.value("blob_count")):
         distance = uniform(rng, least_distance, greatest_distance)
-        x, y = direction(rng)
+        x, y = draw_direction(rng, 2)
         centre = (distance * x, distance * y)
         centres.append(centre)
     cells = size.value("blob_cells")

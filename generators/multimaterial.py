@@ -35,7 +35,7 @@ from .draws import (
     RandomSource,
     add_in_order,
     choice,
-    direction,
+    draw_direction,
     quantise,
 )
 from .shapes import Body, Disc, Rectangle, Shape, place, sample_points
@@ -96,7 +96,7 @@ def _draw_rectangle(rng: RandomSource, size: Size, area: float) -> Shape:
 
 def _draw_rope(rng: RandomSource, size: Size, length: float) -> Shape:
     width = size.value("rope_width")
-    axis = direction(rng)
+    axis = draw_direction(rng, 2)
     return Rectangle(length, width, axis)
 
 

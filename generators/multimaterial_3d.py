@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from .constants import constants, draw_between
-from .draws import RandomSource, direction_in_space
+from .draws import RandomSource, draw_direction
 from .multimaterial import BodyShapes, draw_bodies
 from .solids import Ball, Block, Rod, Solid
 from .split import (
@@ -31,7 +31,7 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
 
 def _draw_rod(rng: RandomSource, size: Size, length: float) -> Solid:
     radius = size.value("rope_radius")
-    axis = direction_in_space(rng)
+    axis = draw_direction(rng, 3)
     return Rod(length, radius, axis)
 
 

@@ -24,21 +24,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .draws import RandomSource, draw_offsets, quantise
+from .draws import RandomSource, draw_direction, draw_offsets, quantise, square_sum
 
 __all__ = [
     "Flow",
     "Smooth",
-    "constant",
     "coordinate",
     "curl",
-    "draw_direction",
     "draw_lattice",
+    "fade",
     "fill_box",
     "noise",
     "rotated_gradient",
     "scaled_to",
     "wrapped_offset",
+    "zero",
 ]
 
 Array = NDArray[np.float64]
@@ -54,60 +54,57 @@ class Smooth:
 
     def __add__(self, other: Smooth) -> Smooth:
         """Add term by term."""
-        value = self.value + other.value
-        gradient = self.gradient + other.gradient
-        hessian = self.hessian + other.hessian
-        return Smooth(value, gradient, hessian)
+        return Smooth(
+            self.value + other.value,
+            self.gradient + other.gradient,
+            self.hessian + other.hessian,
+        )
+
+    def __sub__(self, other: Smooth) -> Smooth:
+        """Subtract term by term."""
+        return self + other.scale(-1.0)
 
     def __mul__(self, other: Smooth) -> Smooth:
         """Multiply by the product rule."""
         f = self.value[:, None]
         g = other.value[:, None]
-        value = self.value * other.value
-        gradient = g * self.gradient + f * other.gradient
-        # f'_i g'_j and its transpose, shape [point, axis, axis]
-        f_column = self.gradient[:, :, None]
-        g_row = other.gradient[:, None, :]
-        crossed = f_column * g_row
-        transposed = crossed.transpose(0, 2, 1)
-        both_crossed = crossed + transposed
-        f_factor = f[..., None]
-        g_factor = g[..., None]
-        hessian = g_factor * self.hessian + f_factor * other.hessian + both_crossed
-        return Smooth(value, gradient, hessian)
+        # f'_i g'_j, shape [point, axis, axis]
+        crossed = self.gradient[:, :, None] * other.gradient[:, None, :]
+        return Smooth(
+            self.value * other.value,
+            g * self.gradient + f * other.gradient,
+            g[..., None] * self.hessian
+            + f[..., None] * other.hessian
+            + (crossed + crossed.transpose(0, 2, 1)),
+        )
 
     def scale(self, factor: Array | float) -> Smooth:
         """Multiply by numbers that do not depend on the point's coordinates."""
-        shape = self.value.shape
-        factors = np.broadcast_to(np.asarray(factor, np.float64), shape)
-        of_gradient = factors[:, None]
-        of_hessian = factors[:, None, None]
-        value = factors * self.value
-        gradient = of_gradient * self.gradient
-        hessian = of_hessian * self.hessian
-        return Smooth(value, gradient, hessian)
+        factors = np.broadcast_to(np.asarray(factor, np.float64), self.value.shape)
+        return Smooth(
+            factors * self.value,
+            factors[:, None] * self.gradient,
+            factors[:, None, None] * self.hessian,
+        )
 
-    def shift(self, amount: Array | float) -> Smooth:
+    def shift(self, amount: NDArray[np.number] | float) -> Smooth:
         """Add numbers that do not depend on the point's coordinates."""
-        value = self.value + amount
-        return Smooth(value, self.gradient, self.hessian)
+        return Smooth(self.value + amount, self.gradient, self.hessian)
 
     def polynomial(self, *coefficients: float) -> Smooth:
         """Return c0 + c1 f + c2 f^2 + ... by Horner's rule."""
         result = self.scale(0.0)
         for coefficient in reversed(coefficients):
-            product = result * self
-            result = product.shift(coefficient)
+            result = (result * self).shift(coefficient)
         return result
 
     def only_where(self, chosen: NDArray[np.bool_]) -> Smooth:
         """Return the function at some points, and zero at the others."""
-        of_gradient = chosen[:, None]
-        of_hessian = chosen[:, None, None]
-        value = np.where(chosen, self.value, 0.0)
-        gradient = np.where(of_gradient, self.gradient, 0.0)
-        hessian = np.where(of_hessian, self.hessian, 0.0)
-        return Smooth(value, gradient, hessian)
+        return Smooth(
+            np.where(chosen, self.value, 0.0),
+            np.where(chosen[:, None], self.gradient, 0.0),
+            np.where(chosen[:, None, None], self.hessian, 0.0),
+        )
 
 
 @dataclass(frozen=True)
@@ -120,51 +117,20 @@ class Flow:
     @property
     def speed_rms(self) -> float:
         """Root mean square of the speed over the points [length/s]."""
-        square_sum = _square_sum(self.velocity)
-        return math.sqrt(square_sum / len(self.velocity))
-
-
-def _square_sum(values: Array) -> float:
-    """Return the sum of the squares of all numbers, rounded once."""
-    numbers = values.ravel()
-    squares = []
-    for number in numbers.tolist():
-        square = number * number
-        squares.append(square)
-    return math.fsum(squares)
+        return math.sqrt(square_sum(self.velocity) / len(self.velocity))
 
 
 def coordinate(values: Array, axis: int, dimension: int) -> Smooth:
     """Return a coordinate, or it less a constant, as a function of the position."""
-    point_count = len(values)
-    gradient_shape = (point_count, dimension)
-    hessian_shape = (point_count, dimension, dimension)
-    gradient = np.zeros(gradient_shape)
+    gradient = np.zeros((len(values), dimension))
     gradient[:, axis] = 1.0
-    hessian = np.zeros(hessian_shape)
-    return Smooth(values, gradient, hessian)
+    return Smooth(values, gradient, np.zeros((len(values), dimension, dimension)))
 
 
-def constant(value: float, point_count: int, dimension: int) -> Smooth:
-    """Return a constant function."""
-    gradient_shape = (point_count, dimension)
-    hessian_shape = (point_count, dimension, dimension)
-    values = np.full(point_count, value)
-    gradient = np.zeros(gradient_shape)
-    hessian = np.zeros(hessian_shape)
-    return Smooth(values, gradient, hessian)
-
-
-def draw_direction(rng: RandomSource, dimension: int) -> Array:
-    """Draw a unit vector, uniform over the circle or sphere, without sine or cosine."""
-    shape = (dimension,)
-    # until a point of the cube lies in the unit ball, and not at its very centre
-    while True:
-        unit = rng.random(shape)
-        vector = 2.0 * unit - 1.0
-        square = _square_sum(vector)
-        if 2.0**-20 <= square <= 1.0:
-            return np.asarray(vector / math.sqrt(square))
+def zero(point_count: int, dimension: int) -> Smooth:
+    """Return the function that is 0."""
+    nowhere = coordinate(np.zeros(point_count), 0, dimension)
+    return nowhere.scale(0.0)
 
 
 def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
@@ -172,18 +138,11 @@ def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
 
     The shape is [frequency, ..., axis]: as many nodes as cells along each axis.
     """
-    count = frequency**dimension
-    vectors = []
-    for _ in range(count):
-        direction = draw_direction(rng, dimension)
-        vectors.append(direction)
-    gradients = np.array(vectors)
-    nodes = [frequency] * dimension
-    shape = (*nodes, dimension)
-    return gradients.reshape(shape)
+    vectors = [draw_direction(rng, dimension) for _ in range(frequency**dimension)]
+    return np.array(vectors).reshape(*[frequency] * dimension, dimension)
 
 
-def _fade(t: Smooth) -> Smooth:
+def fade(t: Smooth) -> Smooth:
     """Return Perlin's 6 t^5 - 15 t^4 + 10 t^3."""
     return t.polynomial(0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
 
@@ -208,40 +167,28 @@ def noise(position: Array, lattice: Array) -> Smooth:
     along = []
     weights = []
     for axis in range(dimension):
-        axis_cell = cell[:, axis]
-        low = axis_cell.astype(np.float64)
-        distance = scaled[:, axis] - low
-        t = coordinate(distance, axis, dimension)
+        t = coordinate(scaled[:, axis] - cell[:, axis], axis, dimension)
         along.append(t)
-        rising = _fade(t)
-        minus_rising = rising.scale(-1.0)
-        falling = minus_rising.shift(1.0)
-        sides = (falling, rising)
-        weights.append(sides)
+        rising = fade(t)
+        weights.append((rising.scale(-1.0).shift(1.0), rising))
 
-    total = constant(0.0, point_count, dimension)
+    total = zero(point_count, dimension)
     for corner in itertools.product((0, 1), repeat=dimension):
-        unwrapped_node = cell + np.array(corner)
-        node = unwrapped_node % frequency  # shape [point, axis]
-        node_of_axis = tuple(node.T)
-        gradient = lattice[node_of_axis]
-        term = constant(0.0, point_count, dimension)
+        node = (cell + np.array(corner)) % frequency  # shape [point, axis]
+        gradient = lattice[tuple(node.T)]
+        term = zero(point_count, dimension)
         for axis, side in enumerate(corner):
-            slope = gradient[:, axis]
-            from_low = along[axis]
-            minus_side = -float(side)
-            from_corner = from_low.shift(minus_side)
-            rise = from_corner.scale(slope)
-            term = term + rise
+            term = term + along[axis].shift(-side).scale(gradient[:, axis])
         for axis, side in enumerate(corner):
-            weight = weights[axis][side]
-            term = term * weight
+            term = term * weights[axis][side]
         total = total + term
 
     # from derivatives per cell of the lattice to derivatives per length
-    gradient = total.gradient * per_length
-    hessian = total.hessian * (per_length * per_length)
-    return Smooth(total.value, gradient, hessian)
+    return Smooth(
+        total.value,
+        total.gradient * per_length,
+        total.hessian * (per_length * per_length),
+    )
 
 
 def wrapped_offset(position: Array, centre: Array) -> Array:
@@ -256,48 +203,31 @@ def wrapped_offset(position: Array, centre: Array) -> Array:
 def rotated_gradient(psi: Smooth) -> Flow:
     """Return the flow u = dpsi/dy, v = -dpsi/dx."""
     slope = psi.gradient
-    u = slope[:, 1]
-    v = -slope[:, 0]
-    components = [u, v]
     curvature = psi.hessian
-    u_gradient = curvature[:, 1]
-    v_gradient = -curvature[:, 0]
-    gradients = [u_gradient, v_gradient]
-    velocity = np.stack(components, axis=1)
-    affine = np.stack(gradients, axis=1)
-    return Flow(velocity, affine)
+    return Flow(
+        np.stack([slope[:, 1], -slope[:, 0]], axis=1),
+        np.stack([curvature[:, 1], -curvature[:, 0]], axis=1),
+    )
 
 
 def curl(potential: Sequence[Smooth]) -> Flow:
     """Return the flow that is the curl of a vector potential."""
-    components = []
-    gradients = []
+    velocity = []
+    affine = []
     for axis in range(3):
         first = (axis + 1) % 3
         second = (axis + 2) % 3
         a = potential[first]
         b = potential[second]
-        b_slope = b.gradient[:, first]
-        a_slope = a.gradient[:, second]
-        component = b_slope - a_slope
-        components.append(component)
-        b_curvature = b.hessian[:, first]
-        a_curvature = a.hessian[:, second]
-        gradient = b_curvature - a_curvature
-        gradients.append(gradient)
-    velocity = np.stack(components, axis=1)
-    affine = np.stack(gradients, axis=1)
-    return Flow(velocity, affine)
+        velocity.append(b.gradient[:, first] - a.gradient[:, second])
+        affine.append(b.hessian[:, first] - a.hessian[:, second])
+    return Flow(np.stack(velocity, axis=1), np.stack(affine, axis=1))
 
 
 def scaled_to(flow: Flow, speed_rms: float) -> Flow:
     """Return a flow of another root mean square speed, as multiples of 2^-20."""
     factor = speed_rms / flow.speed_rms
-    exact_velocity = factor * flow.velocity
-    exact_affine = factor * flow.affine
-    velocity = quantise(exact_velocity)
-    affine = quantise(exact_affine)
-    return Flow(velocity, affine)
+    return Flow(quantise(factor * flow.velocity), quantise(factor * flow.affine))
 
 
 def fill_box(
@@ -322,15 +252,9 @@ def fill_box(
     Returns:
         Positions [length], multiples of 2^-20, shape [particle, axis].
     """
-    dimension = len(counts)
-    indices = np.indices(tuple(counts))
-    cell = indices.reshape(dimension, -1).T
+    cell = np.indices(tuple(counts)).reshape(len(counts), -1).T
     centred = draw_offsets(rng, cell.shape, subdivision=subdivision)
-    displacement = centred * jitter
-    middle = cell + 0.5
-    place = middle + displacement  # [cells]
-    spacings = np.asarray(counts)
-    share = place / spacings  # of the extent
+    place = cell + 0.5 + centred * jitter  # [cells]
+    share = place / np.asarray(counts)  # of the extent
     start = np.asarray(low, np.float64)
-    position = start + (np.asarray(high, np.float64) - start) * share
-    return quantise(position)
+    return quantise(start + (np.asarray(high, np.float64) - start) * share)

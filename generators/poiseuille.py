@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import decaying_vortices
-from .constants import constants, interval
-from .draws import RandomSource, draw_integer, draw_program
+from .constants import constants, interval, start_frame
+from .draws import RandomSource, draw_program
 from .full_box_parameters import FullBoxParameters
 from .split import InitialState
 
@@ -40,13 +40,6 @@ def solver_parameters(size: Size) -> FullBoxParameters:
     return constants(
         FullBoxParameters, size, box=size.box, no_slip=False, force_layers=2
     )
-
-
-def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
-    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
-    del scenario  # the same range for all
-    least, most = interval(size, "start_frame")
-    return draw_integer(rng, least, most)
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:

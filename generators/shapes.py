@@ -71,7 +71,7 @@ class Rectangle:
 
     length: float  # extent along 'axis' [length]
     width: float  # extent across it [length]
-    axis: tuple[float, float] = (1.0, 0.0)  # unit vector
+    axis: tuple[float, ...] = (1.0, 0.0)  # unit vector
 
     @classmethod
     def of_area(cls, area: float, aspect: float) -> Rectangle:

@@ -108,7 +108,7 @@ class Rod:
 
     length: float  # extent along 'axis' [length]
     radius: float  # of its cross-section [length]
-    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)  # unit vector
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)  # unit vector
 
     @property
     def measure(self) -> float:

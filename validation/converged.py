@@ -284,7 +284,7 @@ def initial_flow(size: Size, scenario: int, state: InitialState) -> Flow:
                 high=high,
                 scale=float(state.parameters["scale"]),
             )
-            return np.stack([psi.y, -psi.x], axis=1)
+            return rotated_gradient(psi).velocity
         if size.split == "curl-noise-3d":
             if curl_noise_3d.has_rings(scenario):
                 return curl_noise_3d.draw_rings(size, rng, points).velocity

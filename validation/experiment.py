@@ -26,6 +26,7 @@ from lagbench.generators import cavity, curl_noise
 from lagbench.generators.draws import fill, quantise
 from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.noise import gradients
+from lagbench.generators.periodic_noise import rotated_gradient
 from lagbench.generators.solver import build
 from lagbench.generators.split import (
     Device,
@@ -337,7 +338,9 @@ def initial_state(experiment: Experiment) -> InitialState:
             high=box.high,
             scale=full.value("velocity_scale"),
         )
-        velocity, affine = curl_noise.flow(psi)
+        flow = rotated_gradient(psi)
+        velocity = quantise(flow.velocity)
+        affine = quantise(flow.affine)
 
     wall_velocity = np.zeros((len(WALLS), 2))
     wall_velocity[WALLS.index("top"), 0] = experiment.lid_speed

@@ -221,7 +221,7 @@ def test_choice_is_fair_and_never_reaches_its_count() -> None:
 def test_direction_is_uniform_over_the_circle() -> None:
     """Unit length to rounding, angle uniform by Kolmogorov-Smirnov."""
     rng = source()
-    vectors = [draws.direction(rng) for _ in range(2000)]
+    vectors = [draws.draw_direction(rng, 2) for _ in range(2000)]
     x, y = np.transpose(vectors)
     length = np.hypot(x, y)
     np.testing.assert_allclose(length, 1.0, rtol=3e-16)
@@ -230,6 +230,6 @@ def test_direction_is_uniform_over_the_circle() -> None:
     assert test.pvalue > 0.01
     # Corners and the very centre are refused; (0.6, 0.8) x 1/2 is normalised.
     script = Script(0.0, 0.0, 0.5, 0.5, 0.65, 0.7)
-    direction = draws.direction(script)
+    direction = draws.draw_direction(script, 2)
     assert direction == pytest.approx((0.6, 0.8))
     assert script.values == []

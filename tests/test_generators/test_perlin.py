@@ -1,4 +1,4 @@
-"""Jets, Perlin noise and the stream function against numbers from other routes."""
+"""Derivatives, Perlin noise and the stream function by other routes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from lagbench.generators import curl_noise, draws, noise
+from lagbench.generators.periodic_noise import Smooth, coordinate
 
 LOW = 0.0375
 HIGH = 0.9625
@@ -75,13 +76,18 @@ def psi_by_hand(
     return float(value)
 
 
+def axes_of(position: Array) -> list[Smooth]:
+    """Return both coordinates as functions of the position."""
+    return [coordinate(position[:, axis], axis, 2) for axis in range(2)]
+
+
 def lattice_of(frequency: int) -> Array:
     """Return the gradients of a test lattice."""
     rng = draws.generator("curl-noise", "test", 1, frequency)
     return np.asarray(noise.gradients(rng, frequency))
 
 
-def stream(position: Array, lattice: Array) -> noise.Jet:
+def stream(position: Array, lattice: Array) -> Smooth:
     """Return the stream function of scale 0.01 and its derivatives."""
     return curl_noise.stream_function(
         position,
@@ -97,43 +103,35 @@ def stream(position: Array, lattice: Array) -> noise.Jet:
     x=NUMBERS,
     y=NUMBERS,
 )
-def test_jets_differentiate_polynomials(
+def test_products_differentiate_polynomials(
     coefficients: list[float],
     x: float,
     y: float,
 ) -> None:
     """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
     point = np.array([[x, y]])
-    jet_x, jet_y = noise.coordinates(point)
+    jet_x, jet_y = axes_of(point)
     product = jet_x * jet_y
     p = product.polynomial(*coefficients)
     exact = Polynomial(coefficients)
     first = exact.deriv(1)(x * y)
     second = exact.deriv(2)(x * y)
-    expected = [
-        exact(x * y),
-        y * first,
-        x * first,
-        y * y * second,
-        first + x * y * second,
-        x * x * second,
-    ]
-    derivatives = []
-    for term in (p.value, p.x, p.y, p.xx, p.xy, p.yy):
-        derivatives.append(term[0])
-    assert derivatives == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    across = first + x * y * second
+    hessian = np.array([[y * y * second, across], [across, x * x * second]])
+    assert p.value == pytest.approx(exact(x * y), rel=1e-9, abs=1e-9)
+    assert p.gradient[0] == pytest.approx([y * first, x * first], rel=1e-9, abs=1e-9)
+    assert p.hessian[0] == pytest.approx(hessian, rel=1e-9, abs=1e-9)
 
 
 def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     """Gradient noise: value 0 and gradient g at the nodes, the far corner included."""
     lattice = lattice_of(3)
     node = np.array(list(np.ndindex(4, 4)), float)
-    x, y = noise.coordinates(node)
+    x, y = axes_of(node)
     field = noise.noise(x, y, lattice)
     assert_allclose(field.value, 0.0, atol=1e-15)
-    slope = np.stack([field.x, field.y], -1)
     expected = lattice.reshape(-1, 2)
-    assert_allclose(slope, expected, atol=1e-14)
+    assert_allclose(field.gradient, expected, atol=1e-14)
     large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
     length = np.hypot(*large.T)
     assert_allclose(length, 1.0, rtol=3e-16)
@@ -149,7 +147,7 @@ def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
     """The vectorised jet and a scalar transcription of Eqs. 5.40 and 5.41 agree."""
     lattice = lattice_of(5)
     position = np.array([[x, y]])
-    point = noise.coordinates(position)
+    point = axes_of(position)
     field = noise.noise(*point, lattice)
     expected = noise_by_hand(x, y, lattice)
     value = field.value[0]
@@ -166,7 +164,7 @@ def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
     position = points(60, LOW + 0.001, HIGH - 0.001)
     psi = stream(position, lattice)
     steps = step * np.eye(2)
-    for term, offset in zip((psi.x, psi.y), steps, strict=True):
+    for term, offset in zip(psi.gradient.T, steps, strict=True):
         slopes = []
         for point in position:
             above = psi_by_hand(point + offset, lattice, 0.01)
@@ -186,11 +184,11 @@ def test_no_flow_crosses_the_walls(frequency: int) -> None:
         across = np.full(101, wall)
         upright = np.stack([across, along], axis=-1)
         level = np.stack([along, across], axis=-1)
-        side = stream(upright, lattice)
-        floor = stream(level, lattice)
-        assert not side.y.any()
-        assert not floor.x.any()
-        speed_at_side = np.abs(side.x)
-        speed_at_floor = np.abs(floor.y)
+        side = stream(upright, lattice).gradient
+        floor = stream(level, lattice).gradient
+        assert not side[:, 1].any()
+        assert not floor[:, 0].any()
+        speed_at_side = np.abs(side[:, 0])
+        speed_at_floor = np.abs(floor[:, 1])
         assert speed_at_side.max() > 1e-4
         assert speed_at_floor.max() > 1e-4
