@@ -12,8 +12,7 @@ frame loses less. The hybrid changes the constants of the solver accordingly:
     moduli        exp(e) E                  (all solids)
 
 The time steps of a frame follow from the fastest sound. With all five 0 the model is
-the reference ``coarse-solver``, or with ``times=1.5`` ``coarse-solver-two-thirds``, to
-the bit.
+the coarse solver (:mod:`lagbench.references.coarse_solver`) to the bit.
 """
 
 from __future__ import annotations

@@ -74,16 +74,12 @@ class BoxTables:
         self.periodic = tuple(periodic)
         self.no_slip = no_slip
         # nodes along each axis, ghosts included
-        shape = [count + 2 for count in cells]
-        self.shape = tuple(shape)
+        self.shape = tuple(count + 2 for count in cells)
         self.node_count = math.prod(self.shape)
         # distance between the numbers of neighbours along each axis
-        strides = []
-        for axis in range(self.dimension):
-            later_axes = self.shape[axis + 1 :]
-            stride = math.prod(later_axes)
-            strides.append(stride)
-        self.stride = tuple(strides)
+        self.stride = tuple(
+            math.prod(self.shape[axis + 1 :]) for axis in range(self.dimension)
+        )
         # the multi-index of each node, 0 and cells + 1 for ghosts, shape [node, axis]
         self.index = np.indices(self.shape).reshape(self.dimension, -1).T
         self._last = np.array(self.cells)
@@ -100,18 +96,11 @@ class BoxTables:
         """Return the numbers of nodes with these multi-indices."""
         return np.asarray((index * self.stride).sum(axis=-1), np.int32)
 
-    def _tangential_sign(self) -> int:
-        """Return the sign with which a wall mirrors a tangential component."""
-        if self.no_slip:
-            return -1
-        return 1
-
     def _reflection(self, axis: int) -> NDArray[np.int64]:
         """Return the signs with which a wall across an axis mirrors (v, a scalar)."""
-        tangential_sign = self._tangential_sign()
         sign = np.ones(LANES, np.int64)
-        dimension = self.dimension
-        sign[:dimension] = tangential_sign
+        if self.no_slip:
+            sign[: self.dimension] = -1
         sign[axis] = -1
         return sign
 
@@ -121,44 +110,33 @@ class BoxTables:
         mirrored = np.clip(index, 1, self._last)
         # the node at the same place one period on
         wrapped = (index - 1) % self._last + 1
-        source_index = np.where(self._is_walled, mirrored, wrapped)
-        source = self._number(source_index)
+        source = self._number(np.where(self._is_walled, mirrored, wrapped))
 
         # whether a wall lies between a ghost and its source, shape [ghost, axis]
-        is_outside = self._is_outside[node]
-        is_across = is_outside & self._is_walled
-        ghost_count = len(node)
-        sign_shape = (ghost_count, LANES)
-        sign = np.ones(sign_shape, np.float32)
-        dimension = self.dimension
-        for axis in range(dimension):
-            is_axis_across = is_across[:, axis]
-            is_mirrored = is_axis_across[:, None]
+        is_across = self._is_outside[node] & self._is_walled
+        sign = np.ones((len(node), LANES), np.float32)
+        for axis in range(self.dimension):
+            is_mirrored = is_across[:, axis, None]
             reflection = self._reflection(axis)
             sign *= np.where(is_mirrored, reflection, 1).astype(np.float32)
 
         # Only one wall moves a ghost; where two meet, none does.
         is_single = is_across.sum(axis=1) == 1
         normal = np.argmax(is_across, axis=1)
-        ghosts = np.arange(ghost_count)
-        index_along_normal = index[ghosts, normal]
+        index_along_normal = index[np.arange(len(node)), normal]
         wall = np.where(is_single, 2 * normal + (index_along_normal > 1), 0)
 
-        axes = np.arange(dimension)
-        ghost_normal = normal[:, None]
-        has_one_wall = is_single[:, None]
-        is_tangential = has_one_wall & (axes != ghost_normal)
+        is_other_axis = np.arange(self.dimension) != normal[:, None]
+        is_tangential = is_single[:, None] & is_other_axis
         # In the last cells before a wall that the motion runs into it is halved.
         is_before_wall = ((index == 1) | (index == self._last)) & self._is_walled
         drive = np.where(is_before_wall, 1.0, 2.0) * is_tangential
-        wall = wall.astype(np.int32)
-        drive = drive.astype(np.float32)
         return Ghosts(
             node=node,
             source=source,
             sign=sign,
-            wall=wall,
-            drive=drive,
+            wall=wall.astype(np.int32),
+            drive=drive.astype(np.float32),
         )
 
     def _images(self) -> Images:
@@ -177,35 +155,20 @@ class BoxTables:
         wall_across = 2 * np.arange(dimension) + is_high
 
         # whether an image crosses each axis, one array per image
-        subsets = []
-        choices = (False, True)
-        for crossed in itertools.product(choices, repeat=dimension):
-            if any(crossed):
-                subset = np.array(crossed)
-                subsets.append(subset)
-        edge_count = len(node)
-        image_count = len(subsets)
-        image_shape = (edge_count, image_count)
-        sign_shape = (image_count, LANES)
-        wall_shape = (edge_count, image_count, dimension)
-        ghost = np.full(image_shape, -1, np.int32)
-        sign = np.ones(sign_shape, np.int64)
-        wall = np.full(wall_shape, -1, np.int32)
+        subsets = np.array(list(itertools.product((False, True), repeat=dimension))[1:])
+        ghost = np.full((len(node), len(subsets)), -1, np.int32)
+        sign = np.ones((len(subsets), LANES), np.int64)
+        wall = np.full((*ghost.shape, dimension), -1, np.int32)
 
         for image, subset in enumerate(subsets):
             exists = (is_low | is_high | ~subset).all(axis=1)
-            ghost_index = np.where(subset, beyond, index)
-            number = self._number(ghost_index)
+            number = self._number(np.where(subset, beyond, index))
             ghost[:, image] = np.where(exists, number, -1)
-
             walled_subset = subset & self._is_walled
-            image_exists = exists[:, None]
-            wall[:, image] = np.where(image_exists & walled_subset, wall_across, -1)
-
-            walled_axes = np.flatnonzero(walled_subset)
-            for axis in walled_axes.tolist():
-                reflection = self._reflection(axis)
-                sign[image] *= reflection
+            crosses_wall = exists[:, None] & walled_subset
+            wall[:, image] = np.where(crosses_wall, wall_across, -1)
+            for axis in np.flatnonzero(walled_subset).tolist():
+                sign[image] *= self._reflection(axis)
         return Images(node=node, ghost=ghost, sign=sign, wall=wall)
 
     def ghost_drive(self, wall_velocity: Singles) -> Singles:
@@ -219,14 +182,10 @@ class BoxTables:
             Shape [scenario, ghost, lane].
         """
         ghosts = self.ghosts
-        scenario_count = len(wall_velocity)
-        ghost_count = len(ghosts.node)
-        shape = (scenario_count, ghost_count, LANES)
+        shape = (len(wall_velocity), len(ghosts.node), LANES)
         drive = np.zeros(shape, np.float32)
-        wall = ghosts.wall
-        ghost_wall_velocity = wall_velocity[:, wall]
-        dimension = self.dimension
-        drive[..., :dimension] = ghosts.drive * ghost_wall_velocity
+        ghost_wall_velocity = wall_velocity[:, ghosts.wall]
+        drive[..., : self.dimension] = ghosts.drive * ghost_wall_velocity
         return drive
 
     def image_drag(self, wall_velocity: Singles) -> Singles:
@@ -241,21 +200,14 @@ class BoxTables:
             [length/s], shape [scenario, edge, image, lane].
         """
         images = self.images
-        scenario_count = len(wall_velocity)
-        image_shape = images.ghost.shape
-        shape = (scenario_count, *image_shape, LANES)
+        shape = (len(wall_velocity), *images.ghost.shape, LANES)
         drag = np.zeros(shape, np.float32)
-        zero = np.float32(0.0)
         twice_wall_velocity = np.float32(2.0) * wall_velocity
-        dimension = self.dimension
-        axes = np.arange(dimension)
-        for normal in range(dimension):
+        axes = np.arange(self.dimension)
+        for normal in axes.tolist():
             wall = images.wall[..., normal]
-            is_crossed = wall >= 0
-            is_tangential = axes != normal
-            some_wall = np.maximum(wall, 0)
-            momentum = twice_wall_velocity[:, some_wall]
-            is_image_across = is_crossed[..., None]
-            momentum = np.where(is_image_across & is_tangential, momentum, zero)
-            drag[..., :dimension] += momentum
+            momentum = twice_wall_velocity[:, np.maximum(wall, 0)]
+            is_given = (wall >= 0)[..., None] & (axes != normal)
+            momentum = np.where(is_given, momentum, np.float32(0.0))
+            drag[..., : self.dimension] += momentum
         return drag

@@ -54,12 +54,6 @@ def larger(a: f32, b: f32) -> f32:
 
 
 @ti.func
-def smaller(a: f32, b: f32) -> f32:
-    """Return the smaller of two numbers, b if a is not a number."""
-    return -larger(-a, -b)
-
-
-@ti.func
 def exponential(z: f32) -> f32:
     """Return exp(z): the Taylor polynomial of degree 6 in z/16, squared four times.
 
@@ -79,11 +73,7 @@ def exponential(z: f32) -> f32:
 @ti.func
 def determinant(f: mat2) -> f32:
     """Return det F."""
-    xx = f[0, 0]
-    xy = f[0, 1]
-    yx = f[1, 0]
-    yy = f[1, 1]
-    return xx * yy - xy * yx
+    return f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
 
 
 @ti.func
@@ -92,12 +82,8 @@ def rotation(f: mat2) -> vec3:
 
     Where q vanishes (F a reflection, or nothing at all) R is the identity.
     """
-    xx = f[0, 0]
-    xy = f[0, 1]
-    yx = f[1, 0]
-    yy = f[1, 1]
-    e = 0.5 * (xx + yy)
-    g = 0.5 * (yx - xy)
+    e = 0.5 * (f[0, 0] + f[1, 1])
+    g = 0.5 * (f[1, 0] - f[0, 1])
     q = ti.sqrt(e * e + g * g)
     cosine = 1.0
     sine = 0.0
@@ -111,13 +97,7 @@ def rotation(f: mat2) -> vec3:
 @ti.func
 def shear_parts(f: mat2) -> Value:
     """Return h and k of the scaled reflection in F."""
-    xx = f[0, 0]
-    xy = f[0, 1]
-    yx = f[1, 0]
-    yy = f[1, 1]
-    h = 0.5 * (xx - yy)
-    k = 0.5 * (yx + xy)
-    return h, k
+    return 0.5 * (f[0, 0] - f[1, 1]), 0.5 * (f[1, 0] + f[0, 1])
 
 
 @ti.func
@@ -126,14 +106,12 @@ def viscous_stress(c: mat2, viscosity: f32) -> mat2:
 
     C is the velocity gradient [1/s], mu the dynamic viscosity [mass/s].
     """
-    stretch_rate_x = c[0, 0]
-    stretch_rate_y = c[1, 1]
-    shear_rate = c[0, 1] + c[1, 0]
     double_viscosity = 2.0 * viscosity
-    normal_x = double_viscosity * stretch_rate_x
-    normal_y = double_viscosity * stretch_rate_y
-    shear = viscosity * shear_rate
-    return mat2([normal_x, shear], [shear, normal_y])
+    shear = viscosity * (c[0, 1] + c[1, 0])
+    return mat2(
+        [double_viscosity * c[0, 0], shear],
+        [shear, double_viscosity * c[1, 1]],
+    )
 
 
 @ti.func
@@ -161,9 +139,7 @@ def corotated_stress(f: mat2, mu: f32, la: f32) -> mat2:
     w_factor = double_mu * (2.0 * q - 1.0)
     normal = w_factor * (cosine * h - sine * k)
     shear = w_factor * (cosine * k + sine * h)
-    normal_x = mean + normal
-    normal_y = mean - normal
-    return mat2([normal_x, shear], [shear, normal_y])
+    return mat2([mean + normal, shear], [shear, mean - normal])
 
 
 @ti.func
@@ -173,10 +149,8 @@ def hardening(plastic: f32, exponent: f32, low: f32, high: f32) -> f32:
     Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent``
     is xi [1]. The caps lie within exp(-+EXPONENT_MAX).
     """
-    z = exponent * (1.0 - plastic)
-    z = bounded(z, -EXPONENT_MAX, EXPONENT_MAX)
-    factor = exponential(z)
-    return bounded(factor, low, high)
+    z = bounded(exponent * (1.0 - plastic), -EXPONENT_MAX, EXPONENT_MAX)
+    return bounded(exponential(z), low, high)
 
 
 @ti.func
@@ -207,11 +181,7 @@ def plastic_return(f: mat2, low: f32, high: f32) -> Value:
     g = new_q * sine
     h = r_ratio * h
     k = r_ratio * k
-    xx = e + h
-    xy = k - g
-    yx = k + g
-    yy = e - h
-    elastic = mat2([xx, xy], [yx, yy])
+    elastic = mat2([e + h, k - g], [k + g, e - h])
 
     old_high = larger(trial_high, STRETCH_MIN)
     old_low = larger(trial_low, STRETCH_MIN)

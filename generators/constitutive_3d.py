@@ -39,8 +39,9 @@ from .transfer import Template, Value, bounded
 _NEWTON_STEPS = 6
 # pairs of axes that a sweep rotates, one pair after the other
 _AXIS_PAIRS = ((0, 1), (0, 2), (1, 2))
-# rows of an eigenvector
-_ROWS = (0, 1, 2)
+_AXES = (0, 1, 2)
+# row and column of each entry of a symmetric matrix
+_VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 # sweeps of Jacobi's method over the three pairs of axes
 _SWEEPS = 4
 # lower bound of two divisors: the derivative of the quartic, and
@@ -51,141 +52,89 @@ _EPSILON = 1e-6
 @ti.func
 def rows_of(f: mat3) -> Value:
     """Return the matrix of one particle as a list of rows."""
-    x_row = row_of(f, 0)
-    y_row = row_of(f, 1)
-    z_row = row_of(f, 2)
-    return [x_row, y_row, z_row]
+    return [row_of(f, row) for row in ti.static(_AXES)]
 
 
 @ti.func
 def row_of(f: mat3, row: Template) -> Value:
     """Return a row of the matrix of one particle as a list."""
-    x = f[row, 0]
-    y = f[row, 1]
-    z = f[row, 2]
-    return [x, y, z]
+    return [f[row, column] for column in ti.static(_AXES)]
 
 
 @ti.func
 def dot(a: Template, b: Template) -> Value:
     """Return the dot product of two rows."""
-    a_x, a_y, a_z = a
-    b_x, b_y, b_z = b
-    return a_x * b_x + a_y * b_y + a_z * b_z
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @ti.func
 def times_transposed(rows: Template) -> Value:
     """Return M M^T, a symmetric matrix."""
-    x = rows[0]
-    y = rows[1]
-    z = rows[2]
-    xx = dot(x, x)
-    yy = dot(y, y)
-    zz = dot(z, z)
-    yz = dot(y, z)
-    xz = dot(x, z)
-    xy = dot(x, y)
-    return [xx, yy, zz, yz, xz, xy]
+    return [dot(rows[i], rows[j]) for i, j in ti.static(_VOIGT)]
 
 
 @ti.func
 def symmetric_square(b: Template) -> Value:
     """Return B^2 of a symmetric matrix, a symmetric matrix too."""
     xx, yy, zz, yz, xz, xy = b
-    x = [xx, xy, xz]
-    y = [xy, yy, yz]
-    z = [xz, yz, zz]
-    rows = [x, y, z]
-    return times_transposed(rows)
+    return times_transposed([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 @ti.func
 def times(b: Template, factor: Value) -> Value:
     """Return a symmetric matrix times a number."""
-    xx, yy, zz, yz, xz, xy = b
-    return [
-        factor * xx,
-        factor * yy,
-        factor * zz,
-        factor * yz,
-        factor * xz,
-        factor * xy,
-    ]
+    return [factor * entry for entry in b]
 
 
 @ti.func
 def minus(a: Template, b: Template) -> Value:
     """Return the difference A - B of two symmetric matrices."""
-    xx = a[0] - b[0]
-    yy = a[1] - b[1]
-    zz = a[2] - b[2]
-    yz = a[3] - b[3]
-    xz = a[4] - b[4]
-    xy = a[5] - b[5]
-    return [xx, yy, zz, yz, xz, xy]
+    return [a[entry] - b[entry] for entry in ti.static(range(6))]
 
 
 @ti.func
 def plus_isotropic(b: Template, amount: Value) -> Value:
     """Return B + amount I of a symmetric matrix."""
-    b_xx, b_yy, b_zz, yz, xz, xy = b
-    xx = b_xx + amount
-    yy = b_yy + amount
-    zz = b_zz + amount
-    return [xx, yy, zz, yz, xz, xy]
+    xx, yy, zz, yz, xz, xy = b
+    return [xx + amount, yy + amount, zz + amount, yz, xz, xy]
 
 
 @ti.func
 def principal_minors(b: Template) -> Value:
     """Return the sum of the three principal minors of a symmetric matrix."""
     xx, yy, zz, yz, xz, xy = b
-    # of each minor, the products along its main and along its other diagonal
-    main_x = yy * zz
-    main_z = xx * yy
-    other_x = yz * yz
-    other_y = xz * xz
-    return main_z - xy * xy + (main_x - other_x) + (xx * zz - other_y)
+    return (xx * yy - xy * xy) + (yy * zz - yz * yz) + (xx * zz - xz * xz)
 
 
 @ti.func
 def determinant(rows: Template) -> Value:
     """Return det F, expanded along the first row."""
-    x_row, y_row, z_row = rows
-    xx, xy, xz = x_row
-    yx, yy, yz = y_row
-    zx, zy, zz = z_row
-    # of each minor, the products along its main and along its other diagonal
-    other_z = yy * zx
-    minor_x = yy * zz - yz * zy
-    minor_y = yx * zz - yz * zx
-    return xx * minor_x - xy * minor_y + xz * (yx * zy - other_z)
+    xx, xy, xz = rows[0]
+    yx, yy, yz = rows[1]
+    zx, zy, zz = rows[2]
+    return (
+        xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx)
+    )
 
 
 @ti.func
 def trace(b: Template) -> Value:
     """Return the sum of the diagonal of a symmetric matrix."""
-    xx = b[0]
-    yy = b[1]
-    zz = b[2]
-    return (xx + yy) + zz
+    return b[0] + b[1] + b[2]
 
 
 @ti.func
 def stretch_sum(b: Template, jacobian: Value) -> Value:
     """Return the sum of the principal stretches, the largest root of the quartic."""
     b_trace = trace(b)
-    minors = principal_minors(b)
     linear_factor = 8.0 * jacobian
-    constant_term = 4.0 * minors
+    constant_term = 4.0 * principal_minors(b)
     total = ti.sqrt(3.0 * b_trace)
     for _ in ti.static(range(_NEWTON_STEPS)):
         double_pairs = total * total - b_trace
-        leading_term = double_pairs * double_pairs
-        quartic = leading_term - linear_factor * total - constant_term
+        quartic = double_pairs * double_pairs - linear_factor * total - constant_term
         derivative = 4.0 * total * double_pairs - linear_factor
-        divisor = larger(derivative, _EPSILON)
-        total = total - quartic / divisor
+        total = total - quartic / larger(derivative, _EPSILON)
     return total
 
 
@@ -199,17 +148,10 @@ def left_stretch(b: Template, jacobian: Value) -> Value:
     b_trace = trace(b)
     total = stretch_sum(b, jacobian)
     pairs = 0.5 * (total * total - b_trace)
-    sum_product = pairs * total - jacobian
-    divisor = larger(sum_product, _EPSILON)
-    inverse = 1.0 / divisor
+    inverse = 1.0 / larger(pairs * total - jacobian, _EPSILON)
     # (pairs + tr B) B - B^2 + total J I
-    b_factor = pairs + b_trace
-    b_term = times(b, b_factor)
-    b_square = symmetric_square(b)
-    without_identity = minus(b_term, b_square)
-    isotropic = total * jacobian
-    numerator = plus_isotropic(without_identity, isotropic)
-    return times(numerator, inverse)
+    without_identity = minus(times(b, pairs + b_trace), symmetric_square(b))
+    return times(plus_isotropic(without_identity, total * jacobian), inverse)
 
 
 @ti.func
@@ -221,11 +163,8 @@ def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
     b = times_transposed(rows)
     jacobian = determinant(rows)
     volumetric = la * (jacobian - 1.0) * jacobian
-    v = left_stretch(b, jacobian)
-    strain = minus(b, v)
-    double_mu = 2.0 * mu
-    shear_stress = times(strain, double_mu)
-    return plus_isotropic(shear_stress, volumetric)
+    strain = minus(b, left_stretch(b, jacobian))
+    return plus_isotropic(times(strain, 2.0 * mu), volumetric)
 
 
 @ti.func
@@ -237,27 +176,17 @@ def follow_flow(rows: Template, gradient: Template, dt: f32) -> Value:
         gradient: the velocity gradient C [1/s].
         dt: duration of the substep [s].
     """
-    old_x_row, old_y_row, old_z_row = rows
-    x_gradient, y_gradient, z_gradient = gradient
     columns = transposed(rows)
-    x_rate = dot_with_each(x_gradient, columns)
-    y_rate = dot_with_each(y_gradient, columns)
-    z_rate = dot_with_each(z_gradient, columns)
-    x_row = add_rate(old_x_row, x_rate, dt)
-    y_row = add_rate(old_y_row, y_rate, dt)
-    z_row = add_rate(old_z_row, z_rate, dt)
-    return [x_row, y_row, z_row]
+    return [
+        add_rate(rows[row], dot_with_each(gradient[row], columns), dt)
+        for row in ti.static(_AXES)
+    ]
 
 
 @ti.func
 def add_rate(row: Template, rate: Template, dt: f32) -> Value:
     """Return row + dt rate; the rate is in [1/s]."""
-    old_x, old_y, old_z = row
-    x_rate, y_rate, z_rate = rate
-    x = old_x + dt * x_rate
-    y = old_y + dt * y_rate
-    z = old_z + dt * z_rate
-    return [x, y, z]
+    return [row[column] + dt * rate[column] for column in ti.static(_AXES)]
 
 
 @ti.func
@@ -287,9 +216,10 @@ def rotated(
     p_component: Value, q_component: Value, cosine: Value, sine: Value
 ) -> Value:
     """Return two components after the axes p and q were rotated."""
-    new_p_component = cosine * p_component - sine * q_component
-    new_q_component = sine * p_component + cosine * q_component
-    return new_p_component, new_q_component
+    return (
+        cosine * p_component - sine * q_component,
+        sine * p_component + cosine * q_component,
+    )
 
 
 @ti.func
@@ -305,67 +235,45 @@ def principal_axes(b: Template) -> Value:
     off_diagonal = [yz, xz, xy]
     zero = 0.0 * xx
     one = zero + 1.0
-    x_axis = [one, zero, zero]
-    y_axis = [zero, one, zero]
-    z_axis = [zero, zero, one]
-    axes = [x_axis, y_axis, z_axis]
+    axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     for _ in ti.static(range(_SWEEPS)):
         for p, q in ti.static(_AXIS_PAIRS):
             r = ti.static(3 - p - q)  # the third axis
-            entry_pp = diagonal[p]
-            entry_qq = diagonal[q]
             entry_pq = off_diagonal[r]
-            difference = entry_qq - entry_pp
-            double_entry = 2.0 * entry_pq
-            tangent = rotation_tangent(difference, double_entry)
+            tangent = rotation_tangent(diagonal[q] - diagonal[p], 2.0 * entry_pq)
             cosine = 1.0 / ti.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
 
             shift = tangent * entry_pq
-            diagonal[p] = entry_pp - shift
-            diagonal[q] = entry_qq + shift
+            diagonal[p] = diagonal[p] - shift
+            diagonal[q] = diagonal[q] + shift
             off_diagonal[r] = zero
-            entry_pr = off_diagonal[q]
-            entry_qr = off_diagonal[p]
-            new_pr, new_qr = rotated(entry_pr, entry_qr, cosine, sine)
+            new_pr, new_qr = rotated(off_diagonal[q], off_diagonal[p], cosine, sine)
             off_diagonal[q] = new_pr
             off_diagonal[p] = new_qr
-            for row in ti.static(_ROWS):
-                p_entry = axes[p][row]
-                q_entry = axes[q][row]
-                new_p_entry, new_q_entry = rotated(p_entry, q_entry, cosine, sine)
-                axes[p][row] = new_p_entry
-                axes[q][row] = new_q_entry
+            for row in ti.static(_AXES):
+                new_p, new_q = rotated(axes[p][row], axes[q][row], cosine, sine)
+                axes[p][row] = new_p
+                axes[q][row] = new_q
     return diagonal, axes
 
 
 @ti.func
 def transposed(rows: Template) -> Value:
     """Return the rows of the transposed matrix."""
-    x_column = column_of(rows, 0)
-    y_column = column_of(rows, 1)
-    z_column = column_of(rows, 2)
-    return [x_column, y_column, z_column]
+    return [column_of(rows, column) for column in ti.static(_AXES)]
 
 
 @ti.func
 def column_of(rows: Template, column: Template) -> Value:
     """Return a column of a matrix as a list."""
-    x_row, y_row, z_row = rows
-    x = x_row[column]
-    y = y_row[column]
-    z = z_row[column]
-    return [x, y, z]
+    return [rows[row][column] for row in ti.static(_AXES)]
 
 
 @ti.func
 def dot_with_each(row: Template, rows: Template) -> Value:
     """Return the dot products of a row with three rows."""
-    x_row, y_row, z_row = rows
-    x = dot(row, x_row)
-    y = dot(row, y_row)
-    z = dot(row, z_row)
-    return [x, y, z]
+    return [dot(row, rows[other]) for other in ti.static(_AXES)]
 
 
 @ti.func
@@ -374,13 +282,9 @@ def clamp_ratios(square: Value, low: f32, high: f32) -> Value:
 
     ``square`` is the squared trial stretch, an eigenvalue of B.
     """
-    positive_square = larger(square, 0.0)
-    root = ti.sqrt(positive_square)
-    trial = larger(root, STRETCH_MIN)
+    trial = larger(ti.sqrt(larger(square, 0.0)), STRETCH_MIN)
     clamped = bounded(trial, low, high)
-    ratio = clamped / trial
-    growth = trial / clamped
-    return ratio, growth
+    return clamped / trial, trial / clamped
 
 
 @ti.func
@@ -388,12 +292,7 @@ def elastic_row(
     i: Template, ratios: Template, q_rows: Template, f_columns: Template
 ) -> Value:
     """Return row i of the elastic gradient Q diag(ratios) Q^T F."""
-    first_ratio, second_ratio, third_ratio = ratios
-    q_first, q_second, q_third = q_rows[i]
-    first = first_ratio * q_first
-    second = second_ratio * q_second
-    third = third_ratio * q_third
-    scaled = [first, second, third]
+    scaled = [ratios[axis] * q_rows[i][axis] for axis in ti.static(_AXES)]
     stretch_row = dot_with_each(scaled, q_rows)  # of Q diag(ratios) Q^T
     return dot_with_each(stretch_row, f_columns)
 
@@ -411,18 +310,12 @@ def plastic_return(rows: Template, low: f32, high: f32) -> Value:
         The rows of the elastic gradient, and the factor on Jp: the product of trial
         over clamped stretches.
     """
-    b = times_transposed(rows)
-    squares, axes = principal_axes(b)
-    square_1, square_2, square_3 = squares
-    ratio_1, growth_1 = clamp_ratios(square_1, low, high)
-    ratio_2, growth_2 = clamp_ratios(square_2, low, high)
-    ratio_3, growth_3 = clamp_ratios(square_3, low, high)
-    growth = growth_1 * growth_2 * growth_3
+    squares, axes = principal_axes(times_transposed(rows))
+    ratio_1, growth_1 = clamp_ratios(squares[0], low, high)
+    ratio_2, growth_2 = clamp_ratios(squares[1], low, high)
+    ratio_3, growth_3 = clamp_ratios(squares[2], low, high)
     ratios = [ratio_1, ratio_2, ratio_3]
     q_rows = transposed(axes)
     f_columns = transposed(rows)
-    x_row = elastic_row(0, ratios, q_rows, f_columns)
-    y_row = elastic_row(1, ratios, q_rows, f_columns)
-    z_row = elastic_row(2, ratios, q_rows, f_columns)
-    elastic_rows = [x_row, y_row, z_row]
-    return elastic_rows, growth
+    elastic_rows = [elastic_row(i, ratios, q_rows, f_columns) for i in ti.static(_AXES)]
+    return elastic_rows, growth_1 * growth_2 * growth_3

@@ -60,22 +60,14 @@ def solver_parameters(size: Size) -> FullBoxParameters:
 def lattice_counts(size: Size) -> tuple[int, int]:
     """Return the particles along each axis of the lattice that fills the channel."""
     per_length = int(size.value("lattice"))
-    length, height = size.box.lengths.tolist()
-    exact_columns = per_length * length
-    exact_rows = per_length * height
-    columns = round(exact_columns)
-    rows = round(exact_rows)
+    columns, rows = (round(per_length * side) for side in size.box.lengths.tolist())
     return columns, rows
 
 
 def lattice_places(size: Size) -> Array:
     """Return the places of the lattice [length], shape [place, 2]."""
-    indices = np.indices(lattice_counts(size))
-    cell = indices.reshape(2, -1).T
-    middle = cell + 0.5
-    from_corner = middle / size.value("lattice")
-    corner = np.array(size.box.low)
-    return quantise(corner + from_corner)
+    cell = np.indices(lattice_counts(size)).reshape(2, -1).T
+    return quantise(np.array(size.box.low) + (cell + 0.5) / size.value("lattice"))
 
 
 def _radius(size: Size) -> float:
@@ -90,18 +82,7 @@ def middle_of_disc(size: Size, steps: int) -> tuple[float, float]:
     many places of the lattice.
     """
     offset = steps * size.subdivision / size.value("lattice")
-    _, middle = size.box.centre.tolist()
-    x = float(size.value("obstacle_x"))
-    y = middle + offset
-    return x, y
-
-
-def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
-    """Draw the centre of the fixed disc [length]; only its y differs by scenario."""
-    most_steps = int(size.value("offset_max"))
-    place_count = 2 * most_steps + 1
-    place = choice(rng, place_count)
-    return middle_of_disc(size, place - most_steps)
+    return float(size.value("obstacle_x")), size.box.centre.tolist()[1] + offset
 
 
 def _square(vectors: Array) -> Array:
@@ -118,12 +99,9 @@ def _pairs(x: Array, y: Array) -> Array:
 def moved_out(position: Array, centre: Array, radius: float) -> Array:
     """Return positions of which those inside a disc are put on its rim [length]."""
     way = position - centre
-    square = _square(way)
-    distance = np.sqrt(square)
+    distance = np.sqrt(_square(way))
     stretch = np.where(distance < radius, radius / distance, 1.0)
-    stretched_way = stretch[:, None] * way
-    moved = centre + stretched_way
-    return quantise(moved)
+    return quantise(centre + stretch[:, None] * way)
 
 
 def potential_flow(
@@ -150,22 +128,14 @@ def potential_flow(
     x, y = way.T
     square = _square(way)
     dipole = speed * radius * radius / (square * square)
-    x_square = x * x
-    y_square = y * y
-    u = speed - dipole * (x_square - y_square)
+    u = speed - dipole * (x * x - y * y)
     v = -2.0 * dipole * x * y
-    velocity = _pairs(u, v)
 
-    # The flow is harmonic: two numbers make the gradient.
-    real_part = x_square - 3.0 * y * y  # of (x + iy)^3, over x
-    imaginary_part = 3.0 * x * x - y_square  # of (x + iy)^3, over y
-    double_dipole = 2.0 * dipole
-    stretch = double_dipole * x * real_part / square
-    shear = double_dipole * y * imaginary_part / square
-    gradient_of_u = _pairs(stretch, shear)
-    gradient_of_v = _pairs(shear, -stretch)
-    gradient = _pairs(gradient_of_u, gradient_of_v)
-    return velocity, gradient
+    # The flow is harmonic: two numbers make the gradient. They hold the real part of
+    # (x + iy)^3 over x, and the imaginary part over y.
+    stretch = 2.0 * dipole * x * (x * x - 3.0 * y * y) / square
+    shear = 2.0 * dipole * y * (3.0 * x * x - y * y) / square
+    return _pairs(u, v), _pairs(_pairs(stretch, shear), _pairs(shear, -stretch))
 
 
 def eddy(
@@ -188,87 +158,67 @@ def eddy(
     """
     way = (position - centre) / radius
     square = _square(way)
-    rest = 1.0 - square
-    rest = np.where(square < 1.0, rest, 0.0)
+    rest = np.where(square < 1.0, 1.0 - square, 0.0)
     rate = 3.5 * speed * rest * rest
     x, y = way.T
-    u = -rate * y
-    v = rate * x
-    velocity = _pairs(u, v)
 
     # derivative of the rate with respect to the square, times 2
     slope = -14.0 * speed * rest
-    u_x = -slope * x * y
-    u_y = -slope * y * y - rate
-    v_x = slope * x * x + rate
-    v_y = slope * x * y
-    gradient_of_u = _pairs(u_x, u_y)
-    gradient_of_v = _pairs(v_x, v_y)
-    gradient = _pairs(gradient_of_u, gradient_of_v)
-    gradient = gradient / radius
-    return velocity, gradient
+    gradient = _pairs(
+        _pairs(-slope * x * y, -slope * y * y - rate),
+        _pairs(slope * x * x + rate, slope * x * y),
+    )
+    return _pairs(-rate * y, rate * x), gradient / radius
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw the place of the disc, the Reynolds number, and an eddy behind the disc."""
     start = start_frame(size, scenario, rng)
-    counts = lattice_counts(size)
     box = size.box
     diameter = float(size.value("obstacle_diameter"))
     radius = _radius(size)
-    x, y = draw_centre(size, rng)
+    # only the y of the disc differs by scenario
+    most_steps = int(size.value("offset_max"))
+    x, y = middle_of_disc(size, choice(rng, 2 * most_steps + 1) - most_steps)
     centre = np.array([x, y])
     position = fill_box(
         rng,
-        counts,
+        lattice_counts(size),
         low=box.low,
         high=box.high,
         jitter=size.value("jitter"),
         subdivision=size.subdivision,
     )
     places = lattice_places(size)
-    place_count = len(places)
     is_solid = is_inside(places, (x, y), radius)
-    solid_count = int(is_solid.sum())
-    _check_counts(size, solid_count, place_count)
-    obstacle = Obstacle(
-        centre=(x, y),
-        radius=radius,
-        position=places[is_solid],
-    )
+    _check_counts(size, int(is_solid.sum()), len(places))
+    obstacle = Obstacle(centre=(x, y), radius=radius, position=places[is_solid])
 
     speed = float(size.value("speed"))
     # The eddy ends before the disc and the walls: they would stop it at once, and that
     # compresses the fluid.
     diameters_behind = uniform(rng, 2.0, 2.5)
     diameters_above = uniform(rng, -0.5, 0.5)
-    diameters = np.array([diameters_behind, diameters_above])
-    eddy_centre = centre + diameter * diameters
-    radius_share = uniform(rng, 0.75, 1.0)
-    speed_share = uniform(rng, 0.5, 1.0)
-    eddy_radius = radius_share * diameter
-    eddy_speed = speed_share * speed
+    eddy_centre = centre + diameter * np.array([diameters_behind, diameters_above])
+    eddy_radius = uniform(rng, 0.75, 1.0) * diameter
+    eddy_speed = uniform(rng, 0.5, 1.0) * speed
     if choice(rng, 2):
         eddy_speed = -eddy_speed
 
-    fluid = position[~is_solid]
-    fluid = moved_out(fluid, centre, radius)
+    fluid = moved_out(position[~is_solid], centre, radius)
     velocity, affine = eddy(fluid, eddy_centre, radius=eddy_radius, speed=eddy_speed)
     past, past_affine = potential_flow(fluid, centre, radius=radius, speed=speed)
     velocity += past
     affine += past_affine
 
-    least_reynolds, most_reynolds = interval(size, "reynolds")
-    reynolds = log_uniform(rng, least_reynolds, most_reynolds)
+    reynolds = log_uniform(rng, *interval(size, "reynolds"))
     viscosity = speed * diameter / reynolds
-    particle_count = len(fluid)
-    area = box.volume * particle_count / place_count
     return InitialState(
         position=fluid,
         velocity=quantise(velocity),
         affine=quantise(affine),
-        material=liquid(particle_count),
-        area=area,
+        material=liquid(len(fluid)),
+        area=box.volume * len(fluid) / len(places),
         viscosity=viscosity,
         obstacle=obstacle,
         stream=np.array([speed, 0.0]),

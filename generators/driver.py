@@ -95,9 +95,9 @@ class Driver(ABC, Generic[Parameters]):
         self._substeps = 0
 
     @property
+    @abstractmethod
     def dimension(self) -> int:
         """Number of axes: 2 or 3."""
-        return 2
 
     @abstractmethod
     def _compile(self, atomic: bool, threads: int) -> Kernels:
@@ -138,14 +138,12 @@ class Driver(ABC, Generic[Parameters]):
         p = self.parameters
         kernels = self._kernels
         self._fixed = self._fixed_positions(states)
-        position = stack(states, "position")
-        self._place(position)
+        self._place(stack(states, "position"))
         shape = (self.scenarios, p.particles, 4)
         particle_state = np.empty(shape, np.float32)
         # what stands behind the velocity keeps its value at rest; its slopes are 0
         particle_state[...] = kernels.at_rest
-        velocity = stack(states, "velocity")
-        particle_state[..., : self.dimension] = velocity
+        particle_state[..., : self.dimension] = stack(states, "velocity")
         self._write(kernels.particle_state, particle_state, at_rest=kernels.at_rest)
         affine = stack(states, "affine")
         for axis, field in enumerate(kernels.slopes):
@@ -154,8 +152,7 @@ class Driver(ABC, Generic[Parameters]):
             self._write(field, slope)
 
         # volume of a particle [length^d], shape [scenario]
-        volumes = [state.area / p.particles for state in states]
-        self._volume = np.array(volumes)
+        self._volume = np.array([state.area / p.particles for state in states])
         # volume of a particle in cells
         cell_volumes = self._volume * p.grid**self.dimension
         kernels.particle_volume.from_numpy(cell_volumes.astype(np.float32))
@@ -223,8 +220,7 @@ class Driver(ABC, Generic[Parameters]):
 
     def position(self) -> Singles:
         """Particle positions [length], shape [scenario, particle, axis]."""
-        x = self._read(self._kernels.x)
-        return x[..., : self.dimension]
+        return self._read(self._kernels.x)[..., : self.dimension]
 
     def velocity(self) -> Singles:
         """Particle velocities v_p [length/s], shape [scenario, particle, axis]."""
@@ -248,8 +244,7 @@ class Driver(ABC, Generic[Parameters]):
         """Add an offset to the positions [length], shape [scenario, particle, axis];
         kept in the box.
         """
-        displaced = self.position() + offset.astype(np.float32)
-        self._place(displaced)
+        self._place(self.position() + offset.astype(np.float32))
 
     def _fixed_positions(self, states: Sequence[InitialState]) -> Singles:
         """Return where the particles that never move are, behind those of the states.
@@ -261,12 +256,10 @@ class Driver(ABC, Generic[Parameters]):
 
     def _place(self, position: Singles) -> None:
         """Set the positions, kept in the box; the fields hold zeros beside."""
-        scenarios, particles, dimension = position.shape
-        shape = (scenarios, particles, 4)
-        padded = np.zeros(shape, np.float32)
+        dimension = position.shape[-1]
+        padded = np.zeros((*position.shape[:2], 4), np.float32)
         padded[..., :dimension] = self._inside(position)
-        rows = np.concatenate([padded, self._fixed], axis=1)
-        self._kernels.x.from_numpy(rows)
+        self._kernels.x.from_numpy(np.concatenate([padded, self._fixed], axis=1))
 
     def _write(
         self,
@@ -283,8 +276,7 @@ class Driver(ABC, Generic[Parameters]):
         """
         fixed = np.empty_like(self._fixed)
         fixed[...] = at_rest
-        rows = np.concatenate([values, fixed], axis=1)
-        field.from_numpy(rows)
+        field.from_numpy(np.concatenate([values, fixed], axis=1))
 
     def _inside(self, position: Singles) -> Singles:
         """Return positions clipped to the box [length], shape [..., axis]."""

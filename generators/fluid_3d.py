@@ -24,10 +24,8 @@ from numpy.typing import NDArray
 
 from .constants import constants, draw_between, free_surface_walls
 from .draws import RandomSource, add_in_order, choice, quantise, uniform
-from .shapes import Body, check_room, sample_points
-from .solids import Ball, Block, Solid
+from .shapes import Ball, Block, Body, Shape, check_room, sample_points
 from .split import (
-    FreeSurface3DParameters,
     FreeSurfaceParameters,
     InitialState,
     liquid,
@@ -48,14 +46,14 @@ AT_REST: Point = (0.0, 0.0, 0.0)
 class _LiquidBody(NamedTuple):
     """A body of liquid at the start."""
 
-    solid: Solid
+    solid: Shape
     centre: Point  # [length]
     velocity: Point  # [length/s]
 
 
 def solver_parameters(size: Size) -> FreeSurfaceParameters:
     """Return the solver's constants at this size."""
-    return constants(FreeSurface3DParameters, size)
+    return constants(FreeSurfaceParameters, size, dimension=3)
 
 
 def _draw_vector(rng: RandomSource, size: Size, name: str) -> Point:
@@ -66,7 +64,7 @@ def _draw_vector(rng: RandomSource, size: Size, name: str) -> Point:
     return x, y, z
 
 
-def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> Point:
+def _draw_place(rng: RandomSource, size: Size, solid: Shape, lowest: float) -> Point:
     """Draw where a solid hangs: within the walls' margin, its centre above a height.
 
     Raises:
@@ -77,35 +75,18 @@ def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> P
     least = low + margin
     most = high - margin
     reach_x, reach_y, reach_z = solid.reach
-    # where its centre may lie
-    least_x = least + reach_x
-    least_y = least + reach_y
-    least_z = least + reach_z
-    most_x = most - reach_x
-    most_y = most - reach_y
-    most_z = most - reach_z
-    least_y = max(lowest, least_y)
-
-    bottom = least_y - reach_y
-    across = (least, most)
-    upright = (bottom, most)
-    room = [across, upright, across]
-    check_room(solid, room)
-    x = uniform(rng, least_x, most_x)
-    y = uniform(rng, least_y, most_y)
-    z = uniform(rng, least_z, most_z)
+    least_y = max(lowest, least + reach_y)  # of its centre
+    check_room(solid, [(least, most), (least_y - reach_y, most), (least, most)])
+    x = uniform(rng, least + reach_x, most - reach_x)
+    y = uniform(rng, least_y, most - reach_y)
+    z = uniform(rng, least + reach_z, most - reach_z)
     return x, y, z
 
 
-def _falling_ball(rng: RandomSource, size: Size) -> InitialState:
-    radius = draw_between(rng, size, "ball_radius")
-    ball = Ball(radius)
-    lowest = size.value("fall_height")
-    centre = _draw_place(rng, size, ball, lowest)
-    velocity = _draw_vector(rng, size, "fall_velocity")
-    body = _LiquidBody(ball, centre, velocity)
-    bodies = [body]
-    return _state(rng, size, "falling-ball", bodies)
+def _falling_ball(rng: RandomSource, size: Size) -> list[_LiquidBody]:
+    ball = Ball(draw_between(rng, size, "ball_radius"))
+    centre = _draw_place(rng, size, ball, size.value("fall_height"))
+    return [_LiquidBody(ball, centre, _draw_vector(rng, size, "fall_velocity"))]
 
 
 def _draw_sign(rng: RandomSource) -> float:
@@ -115,146 +96,98 @@ def _draw_sign(rng: RandomSource) -> float:
     return 1.0
 
 
-def _thrown_block(rng: RandomSource, size: Size) -> InitialState:
+def _thrown_block(rng: RandomSource, size: Size) -> list[_LiquidBody]:
     width = draw_between(rng, size, "block_side")
     height = draw_between(rng, size, "block_side")
     depth = draw_between(rng, size, "block_side")
-    sides = (width, height, depth)
-    block = Block(sides)
+    block = Block((width, height, depth))
     centre = _draw_place(rng, size, block, 0.0)
     u, v, w = _draw_vector(rng, size, "throw_velocity")
     # towards either end of both horizontal axes
     sign_x = _draw_sign(rng)
     sign_z = _draw_sign(rng)
-    velocity_x = sign_x * u
-    velocity_z = sign_z * w
-    velocity = (velocity_x, v, velocity_z)
-    body = _LiquidBody(block, centre, velocity)
-    bodies = [body]
-    return _state(rng, size, "thrown-block", bodies)
+    return [_LiquidBody(block, centre, (sign_x * u, v, sign_z * w))]
 
 
-def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
+def _dam_break(rng: RandomSource, size: Size, number: int) -> list[_LiquidBody]:
     low, high = free_surface_walls(size)
-    walls = (low, high)
     side = high - low
     middle = 0.5 * (low + high)
     width = draw_between(rng, size, "column_width")
     height = draw_between(rng, size, "column_height")
-    half_width = 0.5 * width
-    half_height = 0.5 * height
-    start = low + half_width
+    start = low + 0.5 * width
     if choice(rng, 2) == 1:
-        start = high - half_width
-    y = low + half_height
-    sides = (width, height, side)
+        start = high - 0.5 * width
+    y = low + 0.5 * height
+    column = Block((width, height, side))
     centre = (start, y, middle)
-    is_turned = number % 2 == 1
-    if is_turned:
-        sides = (side, height, width)
+    if number % 2 == 1:  # turned
+        column = Block((side, height, width))
         centre = (middle, y, start)
-    column = Block(sides)
-    room = [walls, walls, walls]
-    check_room(column, room)
-    body = _LiquidBody(column, centre, AT_REST)
-    bodies = [body]
-    return _state(rng, size, "dam-break", bodies)
+    check_room(column, [(low, high)] * 3)
+    return [_LiquidBody(column, centre, AT_REST)]
 
 
-def _splash(rng: RandomSource, size: Size) -> InitialState:
+def _splash(rng: RandomSource, size: Size) -> list[_LiquidBody]:
     low, high = free_surface_walls(size)
-    walls = (low, high)
     side = high - low
     middle = 0.5 * (low + high)
     depth = draw_between(rng, size, "pool_depth")
-    half_depth = 0.5 * depth
-    sides = (side, depth, side)
-    pool = Block(sides)
-    room = [walls, walls, walls]
-    check_room(pool, room)
-    pool_y = low + half_depth
-    pool_centre = (middle, pool_y, middle)
+    pool = Block((side, depth, side))
+    check_room(pool, [(low, high)] * 3)
     radius = draw_between(rng, size, "drop_radius")
     ball = Ball(radius)
-    margin = size.value("margin")
-    lowest = low + depth + margin + radius
+    lowest = low + depth + size.value("margin") + radius
     ball_centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "drop_velocity")
-    pool_body = _LiquidBody(pool, pool_centre, AT_REST)
-    ball_body = _LiquidBody(ball, ball_centre, velocity)
-    bodies = [pool_body, ball_body]
-    return _state(rng, size, "splash", bodies)
+    return [
+        _LiquidBody(pool, (middle, low + 0.5 * depth, middle), AT_REST),
+        _LiquidBody(ball, ball_centre, velocity),
+    ]
 
 
-def _state(
-    rng: RandomSource,
-    size: Size,
-    family: str,
-    bodies: list[_LiquidBody],
-) -> InitialState:
-    """Return the initial state of bodies of liquid.
+def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
+    """Draw one or two bodies of liquid, their places and velocities.
 
     Particles are shared out by volume; the last body has what rounding leaves.
     """
+    family = FAMILIES[scenario % len(FAMILIES)]
+    if family == "falling-ball":
+        bodies = _falling_ball(rng, size)
+    elif family == "thrown-block":
+        bodies = _thrown_block(rng, size)
+    elif family == "dam-break":
+        bodies = _dam_break(rng, size, scenario // len(FAMILIES))
+    else:
+        bodies = _splash(rng, size)
+
+    particles = size.particles
     volumes = [body.solid.measure for body in bodies]
     total_volume = add_in_order(volumes)
-    particles = size.particles
+    counts = [int(particles * (volume / total_volume)) for volume in volumes[:-1]]
+    counts.append(particles - sum(counts))
     positions = []
     velocities = []
-    left_count = particles
-    last_index = len(bodies) - 1
-    for index, body in enumerate(bodies):
-        count = left_count
-        if index < last_index:
-            volume = volumes[index]
-            count = int(particles * (volume / total_volume))
-        left_count -= count
-        centre = np.array(body.centre)
-        place = Body(body.solid, centre)
-        body_position = sample_points(rng, place, count)
-        body_shape = body_position.shape
-        body_velocity = np.full(body_shape, body.velocity)
-        positions.append(body_position)
-        velocities.append(body_velocity)
+    for body, count in zip(bodies, counts, strict=True):
+        place = Body(body.solid, np.array(body.centre))
+        positions.append(sample_points(rng, place, count))
+        velocities.append(np.full((count, 3), body.velocity))
 
-    low, high = free_surface_walls(size)
-    all_velocities = np.concatenate(velocities)
-    position = np.clip(np.concatenate(positions), low, high)
-    velocity = quantise(all_velocities)
-    affine_shape = (particles, 3, 3)
-    affine = np.zeros(affine_shape)
     last_body = bodies[-1]
     last_centre = quantise(last_body.centre)
-    last_velocity = last_body.velocity
     parameters: dict[str, int | float | str] = {
         "family": family,
         "volume": total_volume,
     }
     for axis, name in enumerate("xyz"):
-        coordinate = last_centre[axis]
-        component = last_velocity[axis]
-        parameters[f"centre_{name}"] = float(coordinate)
-        parameters[f"velocity_{name}"] = float(component)
+        parameters[f"centre_{name}"] = float(last_centre[axis])
+        parameters[f"velocity_{name}"] = float(last_body.velocity[axis])
     return InitialState(
-        position=position,
-        velocity=velocity,
-        affine=affine,
+        position=np.clip(np.concatenate(positions), *free_surface_walls(size)),
+        velocity=quantise(np.concatenate(velocities)),
+        affine=np.zeros((particles, 3, 3)),
         material=liquid(particles),
         area=total_volume,
         wall_velocity=np.zeros((6, 3)),
         parameters=parameters,
     )
-
-
-def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
-    """Draw one or two bodies of liquid, their places and velocities."""
-    family_count = len(FAMILIES)
-    family = FAMILIES[scenario % family_count]
-    if family == "falling-ball":
-        return _falling_ball(rng, size)
-    if family == "thrown-block":
-        return _thrown_block(rng, size)
-    if family == "dam-break":
-        number = scenario // family_count
-        return _dam_break(rng, size, number)
-    return _splash(rng, size)

@@ -1,8 +1,9 @@
-"""Liquid, jelly, snow and rope with a free surface: fluid and multimaterial.
+"""Liquid, jelly, snow and rope with a free surface, in the plane or in a cube.
 
-The equations stand in :mod:`.particle_stress`, the stresses in :mod:`.constitutive`.
-The walls lie on node ``wall`` and its mirror image; the fluid slides along them or is
-braked by friction.
+The equations stand in :mod:`.particle_stress`, the stresses in :mod:`.constitutive` and
+:mod:`.constitutive_3d`. The walls lie on node ``wall`` and its mirror image along each
+axis; the fluid slides along them or is braked by friction. Gravity acts along the
+second axis.
 
 The solver is valid while no particle crosses more than a cell per substep, max abs(v)
 dt <= dx (checked), and while sound does not either: keep every value of :func:`courant`
@@ -11,7 +12,6 @@ the splits.
 """
 
 import math
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .driver import Driver, stack
+from .driver import Driver, Field, stack
 from .free_surface_kernels import FreeSurfaceKernels
 from .particle_stress import ParticleStress
+from .particle_stress_3d import ParticleStress3D
 from .solver import Health, Singles
 from .soundness import sound_speeds
 from .split import FreeSurfaceParameters, InitialState, Material
@@ -44,10 +45,8 @@ def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     p = parameters
     numbers = {}
     for material, sound_speed in sound_speeds(p).items():
-        fastest = sound_speed
-        if material is Material.SNOW:
-            fastest = sound_speed * math.sqrt(p.snow_hardening_max)
-        numbers[material] = fastest * p.dt * p.grid
+        numbers[material] = sound_speed * p.dt * p.grid
+    numbers[Material.SNOW] *= math.sqrt(p.snow_hardening_max)
     return numbers
 
 
@@ -68,20 +67,39 @@ class Energy:
         return self.kinetic + self.gravitational + self.elastic
 
 
-class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
-    """What solvers of free surfaces share in the plane and in space."""
+class FreeSurface(Driver[FreeSurfaceParameters]):
+    """Solver of a free surface in the plane or in a cube.
+
+    Its methods are those of :class:`.Solver`.
+    """
 
     _kernels: FreeSurfaceKernels
 
-    @abstractmethod
+    @property
+    def dimension(self) -> int:
+        """Number of axes: 2 or 3."""
+        return self.parameters.dimension
+
+    def _compile(self, atomic: bool, threads: int) -> FreeSurfaceKernels:
+        kernels = ParticleStress if self.dimension == 2 else ParticleStress3D
+        return kernels(
+            self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
+        )
+
     def deformation(self) -> Singles:
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
         particle, axis, axis].
         """
+        return self._matrices(self._kernels.deformation_columns)
 
-    @abstractmethod
-    def _set_deformation(self, gradients: Singles) -> None:
-        """Fill the field of F, shape [scenario, particle, axis, axis]."""
+    def affine(self) -> Singles:
+        """APIC matrices C = grad v [1/s], shape [scenario, particle, axis, axis]."""
+        return self._matrices(self._kernels.slopes)
+
+    def _matrices(self, fields: Sequence[Field]) -> Singles:
+        """Return matrices from the fields of their columns."""
+        columns = [field.to_numpy()[..., : self.dimension] for field in fields]
+        return np.stack(columns, axis=-1)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
@@ -96,27 +114,20 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
 
     def _start(self, states: Sequence[InitialState]) -> None:
         kernels = self._kernels
-        scenarios = self.scenarios
-        particles = self.parameters.particles
         # Material of each particle, shape [scenario, particle]
-        material = stack(states, "material")
-        self._material = material.astype(np.int32)
+        self._material = stack(states, "material").astype(np.int32)
         kernels.sort_by_material(self._material)
 
-        matter_shape = (scenarios, particles, 4)
-        matter = np.ones(matter_shape, np.float32)
+        shape = (self.scenarios, self.parameters.particles, 4)
+        matter = np.ones(shape, np.float32)
         matter[..., 0] = self._material
         kernels.matter.from_numpy(matter)
-
-        dimension = self.dimension
-        identity = np.eye(dimension, dtype=np.float32)
-        gradient_shape = (scenarios, particles, dimension, dimension)
-        gradients = np.empty(gradient_shape, np.float32)
-        gradients[...] = identity
-        self._set_deformation(gradients)
-
-        frictions = [state.friction for state in states]
-        friction = np.array(frictions, np.float32)
+        # F is the identity
+        for axis, field in enumerate(kernels.deformation_columns):
+            column = np.zeros(shape, np.float32)
+            column[..., axis] = 1.0
+            field.from_numpy(column)
+        friction = np.array([state.friction for state in states], np.float32)
         kernels.friction.from_numpy(friction)
 
     def health(self) -> list[Health]:
@@ -126,22 +137,17 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         """
         extremes = self._read(self._kernels.extremes)
         # largest abs(v) + abs(A o) of each scenario
-        reach = extremes[..., 3]
-        self._reach = reach.max(axis=1)
+        self._reach = extremes[..., 3].max(axis=1)
         # The kernels keep a huge number where they saw something that is none.
         extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
         healths = []
         for extreme in extremes:
             speed, jacobian_min, jacobian_max, _ = extreme.T
-            all_finite = np.isfinite(extreme).all()
-            fastest = speed.max()
-            least_jacobian = jacobian_min.min()
-            greatest_jacobian = jacobian_max.max()
             health = Health(
-                finite=bool(all_finite),
-                max_speed=float(fastest),
-                jacobian_min=float(least_jacobian),
-                jacobian_max=float(greatest_jacobian),
+                finite=bool(np.isfinite(extreme).all()),
+                max_speed=float(speed.max()),
+                jacobian_min=float(jacobian_min.min()),
+                jacobian_max=float(jacobian_max.max()),
             )
             healths.append(health)
         return healths
@@ -155,39 +161,24 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
             return {name: f"{quantity} = {reach:.6g}"}
         return {}
 
-    def affine(self) -> Singles:
-        """APIC matrices C = grad v [1/s], shape [scenario, particle, axis, axis]."""
-        columns = []
-        for field in self._kernels.slopes:
-            slope = field.to_numpy()
-            column = slope[..., : self.dimension]
-            columns.append(column)
-        return np.stack(columns, axis=-1)
-
     def volume_ratio(self) -> Singles:
         """J of liquid, plastic Jp of snow, 1 in other solids [1], shape [scenario,
         particle].
         """
-        matter = self._read(self._kernels.matter)
-        return matter[..., 1]
+        return self._read(self._kernels.matter)[..., 1]
 
-    def volume_ratio_extremes(
-        self,
-    ) -> tuple[Singles, Singles]:
+    def volume_ratio_extremes(self) -> tuple[Singles, Singles]:
         """Smallest and largest :meth:`volume_ratio` of each particle at any substep
         since the start [1], each of shape [scenario, particle].
         """
         matter = self._read(self._kernels.matter)
-        least = matter[..., 2]
-        greatest = matter[..., 3]
-        return least, greatest
+        return matter[..., 2], matter[..., 3]
 
     def jacobian(self) -> Singles:
         """J of liquid, det F of solids (elastic in snow) [1], shape [scenario,
         particle].
         """
-        deformation = self.deformation()
-        determinant = np.linalg.det(deformation)
+        determinant = np.linalg.det(self.deformation())
         ratio = self.volume_ratio()
         return np.where(self._material == Material.LIQUID, ratio, determinant)
 
@@ -201,18 +192,14 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         affine = _exact(self.affine())
 
         # abs(v)^2 + dx^2/4 abs(C)^2 of each particle, shape [scenario, particle]
-        affine_squares = np.square(affine)
         velocity_square = np.square(velocity).sum(axis=-1)
-        affine_square = affine_squares.sum(axis=(-2, -1))
+        affine_square = np.square(affine).sum(axis=(-2, -1))
         motion = velocity_square + affine_square / (4.0 * p.grid**2)
         kinetic = 0.5 * mass * motion.sum(axis=-1)
 
-        y = position[..., 1]
-        floor = self._kernels.position_min
-        gravitational = weight * (y - floor).sum(axis=-1)
-
-        elastic_density = self._elastic_density()
-        elastic = self._volume * elastic_density.sum(axis=-1)
+        height = position[..., 1] - self._kernels.position_min
+        gravitational = weight * height.sum(axis=-1)
+        elastic = self._volume * self._elastic_density().sum(axis=-1)
         return Energy(
             kinetic=kinetic,
             gravitational=gravitational,
@@ -233,10 +220,11 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         shear = np.square(stretches - 1.0).sum(axis=-1)
         bulk = 0.5 * (jacobian - 1.0) ** 2
 
-        hardening = np.exp(p.snow_hardening * (1.0 - ratio))
-        least_hardening = p.snow_hardening_min
-        greatest_hardening = p.snow_hardening_max
-        hardening = np.clip(hardening, least_hardening, greatest_hardening)
+        hardening = np.clip(
+            np.exp(p.snow_hardening * (1.0 - ratio)),
+            p.snow_hardening_min,
+            p.snow_hardening_max,
+        )
 
         density = p.liquid_modulus * (ratio - 1.0 - np.log(ratio))
         moduli = {
@@ -250,23 +238,3 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
                 psi = psi * hardening
             density = np.where(self._material == material, psi, density)
         return np.asarray(density)
-
-
-class FreeSurface(FreeSurfaceDriver):
-    """Solver of a free surface; its methods are those of :class:`.Solver`."""
-
-    _kernels: ParticleStress
-
-    def _compile(self, atomic: bool, threads: int) -> ParticleStress:
-        return ParticleStress(
-            self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
-        )
-
-    def deformation(self) -> Singles:
-        """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
-        particle, 2, 2].
-        """
-        return np.asarray(self._kernels.deformation.to_numpy())
-
-    def _set_deformation(self, gradients: Singles) -> None:
-        self._kernels.deformation.from_numpy(gradients)

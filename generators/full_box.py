@@ -47,10 +47,9 @@ class FullBox(Driver[FullBoxParameters]):
         self._states = list(states)
         self._drive_towards(0)
         # nu dt / dx^2, shape [scenario]
-        viscosities = [state.viscosity for state in states]
-        diffusion_number = np.array(viscosities) * p.dt * p.grid**2
-        rounded_number = diffusion_number.astype(np.float32)
-        kernels.diffusion_number.from_numpy(rounded_number)
+        viscosities = np.array([state.viscosity for state in states])
+        diffusion_number = viscosities * p.dt * p.grid**2
+        kernels.diffusion_number.from_numpy(diffusion_number.astype(np.float32))
         if p.obstacle_particles:
             obstacles = [one.obstacle for one in states if one.obstacle is not None]
             kernels.place_obstacles(obstacles)
@@ -71,8 +70,7 @@ class FullBox(Driver[FullBoxParameters]):
         is_periodic = box.periodic
         start = np.asarray(box.low, np.float32)
         end = np.asarray(box.high, np.float32)
-        exact = box.wrap(position)
-        wrapped = exact.astype(np.float32)
+        wrapped = box.wrap(position).astype(np.float32)
         # Rounding to float32 may reach the end of a period, which is its start.
         wrapped = np.where((wrapped >= end) & is_periodic, start, wrapped)
         clipped = super()._inside(wrapped)
@@ -80,15 +78,11 @@ class FullBox(Driver[FullBoxParameters]):
 
     def _fixed_positions(self, states: Sequence[InitialState]) -> Singles:
         """Return the positions of the obstacles' particles, filled up with zeros."""
-        scenarios = len(states)
-        particles = self.parameters.obstacle_particles
-        shape = (scenarios, particles, LANES)
+        shape = (len(states), self.parameters.obstacle_particles, LANES)
         position = np.zeros(shape, np.float32)
-        for index, state in enumerate(states):
-            obstacle = state.obstacle
-            if obstacle is not None:
-                rows = position[index]
-                rows[:, : self.dimension] = obstacle.position
+        for rows, state in zip(position, states, strict=True):
+            if state.obstacle is not None:
+                rows[:, : self.dimension] = state.obstacle.position
         return position
 
     def move_walls(self, velocity: Singles) -> None:
@@ -99,14 +93,11 @@ class FullBox(Driver[FullBoxParameters]):
 
     def _drive_towards(self, frame: int) -> None:
         """Set walls and forces as they act up to a frame."""
-        kernels = self._kernels
-        walls = [state.walls_towards(frame) for state in self._states]
-        exact_velocity = np.stack(walls)
-        self.move_walls(exact_velocity.astype(np.float32))
+        walls = np.stack([state.walls_towards(frame) for state in self._states])
+        self.move_walls(walls.astype(np.float32))
         if self.parameters.force_layers:
-            forces = [state.force_towards(frame) for state in self._states]
-            body_force = np.stack(forces).astype(np.float32)
-            kernels.apply_force(body_force)
+            forces = np.stack([state.force_towards(frame) for state in self._states])
+            self._kernels.apply_force(forces.astype(np.float32))
 
     def _drive(self, end: int) -> int:
         is_driven = any(
@@ -124,11 +115,8 @@ class FullBox(Driver[FullBoxParameters]):
 
     def jacobian(self) -> Singles:
         """Volume ratio J of the fluid's particles [1], shape [scenario, particle]."""
-        particles = self.parameters.particles
         state = self._kernels.particle_state.to_numpy()
-        fluid = state[:, :particles]
-        jacobian = fluid[..., 3]
-        return np.asarray(jacobian)
+        return np.asarray(state[:, : self.parameters.particles, 3])
 
     def grid_velocity(self) -> Singles:
         """Nodal velocities of the last substep [length/s].
@@ -138,13 +126,9 @@ class FullBox(Driver[FullBoxParameters]):
         kernels = self._kernels
         nodes = kernels.tables.shape
         values = kernels.next_state.to_numpy().reshape(self.scenarios, *nodes, -1)
-        without_ghosts = slice(1, -1)
-        places = [slice(None)]
-        for _ in nodes:
-            places.append(without_ghosts)
-        interior = values[tuple(places)]
-        velocity = interior[..., : self.dimension]
-        return np.asarray(velocity)
+        without_ghosts = (slice(1, -1),) * len(nodes)
+        interior = values[(slice(None), *without_ghosts)]
+        return np.asarray(interior[..., : self.dimension])
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance.
@@ -153,26 +137,18 @@ class FullBox(Driver[FullBoxParameters]):
         """
         kernels = self._kernels
         # largest velocity of any particle by component, and J, shape [scenario, 4]
-        particle_extremes = self._read(kernels.extremes)
-        extremes = particle_extremes.max(axis=1)
+        extremes = self._read(kernels.extremes).max(axis=1)
         # the fields of positions hold the largest -J of each particle
-        positions = self._read(kernels.x)
-        minus_jacobians = positions[..., 3]
-        lowest = minus_jacobians.max(axis=1)
+        lowest = self._read(kernels.x)[..., 3].max(axis=1)
         # largest velocity component of any node, shape [scenario]
         peaks = kernels.peak_speed.to_numpy().max(axis=1)
         healths = []
         for extreme, low, peak in zip(extremes, lowest, peaks, strict=True):
             *speeds, jacobian = extreme
-            numbers = [*extreme, low, peak]
-            is_finite = np.isfinite(numbers)
-            all_speeds = [*speeds, peak]
-            max_speed = np.max(all_speeds)
-            jacobian_min = -low
             health = Health(
-                finite=bool(is_finite.all()),
-                max_speed=float(max_speed),
-                jacobian_min=float(jacobian_min),
+                finite=bool(np.isfinite([*extreme, low, peak]).all()),
+                max_speed=float(np.max([*speeds, peak])),
+                jacobian_min=float(-low),
                 jacobian_max=float(jacobian),
             )
             healths.append(health)

@@ -86,7 +86,7 @@ _ATTEMPTS = 1000
 
 def solver_parameters(size: Size) -> FreeSurfaceParameters:
     """Return the solver's constants at this size."""
-    return constants(FreeSurfaceParameters, size)
+    return constants(FreeSurfaceParameters, size, dimension=size.dimension)
 
 
 def _draw_rectangle(rng: RandomSource, size: Size, area: float) -> Shape:
@@ -129,43 +129,21 @@ def _probe_nodes(shape: Shape, cell_count: int) -> Array:
     """Return nodes of a grid over a bounding box about the origin [length], shape
     [node, axis].
     """
-    numbers = np.arange(cell_count + 1)
-    from_middle = 2.0 * numbers - cell_count  # [half a cell]
-    unit_axis = from_middle / cell_count  # from -1 to 1
+    # from -1 to 1
+    unit_axis = (2.0 * np.arange(cell_count + 1) - cell_count) / cell_count
     axes = [unit_axis * reach for reach in shape.reach]
-    coordinates = np.meshgrid(*axes)
-    columns = []
-    for along in coordinates:
-        column = along.ravel()
-        columns.append(column)
-    return np.stack(columns, axis=-1)
-
-
-def _keeps_gap(
-    first: Body,
-    second: Body,
-    offsets: Array,
-    gap: float,
-) -> bool:
-    """Tell whether the second body keeps a gap [length] from the first.
-
-    It is probed at those offsets from its centre that lie inside it.
-    """
-    nodes = second.centre + offsets
-    is_inside = second.distance(nodes) <= 0.0
-    inner_nodes = nodes[is_inside]
-    distance = first.distance(inner_nodes)
-    return float(distance.min()) >= gap
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
 
 
 def _are_apart(bodies: Sequence[Body], offsets: Sequence[Array], gap: float) -> bool:
-    """Tell whether all bodies keep a gap [length] from one another."""
-    numbers = range(len(bodies))
-    for i, j in combinations(numbers, 2):
-        first = bodies[i]
-        second = bodies[j]
-        second_offsets = offsets[j]
-        if not _keeps_gap(first, second, second_offsets, gap):
+    """Tell whether all bodies keep a gap [length] from one another.
+
+    The later one of two is probed at those offsets from its centre that lie inside it.
+    """
+    for i, j in combinations(range(len(bodies)), 2):
+        nodes = bodies[j].centre + offsets[j]
+        is_inside = bodies[j].distance(nodes) <= 0.0
+        if float(bodies[i].distance(nodes[is_inside]).min()) < gap:
             return False
     return True
 
@@ -178,16 +156,10 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
     """
     low, high = free_surface_walls(size)
     margin = size.value("margin")
-    inner_low = low + margin
-    inner_high = high - margin
-    inner = (inner_low, inner_high)
-    region = size.dimension * [inner]
+    region = size.dimension * [(low + margin, high - margin)]
     gap = float(size.value("gap"))
     cell_count = int(size.value("gap_cells"))
-    offsets = []
-    for shape in shapes:
-        shape_offsets = _probe_nodes(shape, cell_count)
-        offsets.append(shape_offsets)
+    offsets = [_probe_nodes(shape, cell_count) for shape in shapes]
 
     for _ in range(_ATTEMPTS):
         bodies = [place(rng, shape, region) for shape in shapes]
@@ -213,16 +185,12 @@ def _body_parameters(
     measure_name = "volume"
     if len(velocity) == 2:
         measure_name = "area"
-    shape_class = type(body.shape)
-    shape_name = shape_class.__name__.lower()
     parameters: dict[str, int | float | str] = {
-        f"{name}_shape": shape_name,
+        f"{name}_shape": type(body.shape).__name__.lower(),
         f"{name}_{measure_name}": measure,
     }
-    vectors = {"centre": body.centre, "velocity": velocity}
-    for quantity, vector in vectors.items():
-        components = vector.tolist()
-        for axis, component in zip("xyz", components, strict=False):
+    for quantity, vector in (("centre", body.centre), ("velocity", velocity)):
+        for axis, component in zip("xyz", vector.tolist(), strict=False):
             parameters[f"{name}_{quantity}_{axis}"] = component
     return parameters
 
@@ -232,11 +200,8 @@ def _share_particles(particle_count: int, measures: Sequence[float]) -> list[int
     area = add_in_order(measures)
     counts = []
     for body_area in measures[:-1]:
-        count = math.floor(particle_count * body_area / area + 0.5)
-        counts.append(count)
-    last_count = particle_count - sum(counts)
-    counts.append(last_count)
-    return counts
+        counts.append(math.floor(particle_count * body_area / area + 0.5))
+    return [*counts, particle_count - sum(counts)]
 
 
 def _materials(size: Size, scenario: int) -> tuple[Material, ...]:
@@ -245,15 +210,6 @@ def _materials(size: Size, scenario: int) -> tuple[Material, ...]:
     if number is None:
         return PAIRS[scenario % len(PAIRS)]
     return TRIPLES[number % len(TRIPLES)]
-
-
-def _draw_attractor(rng: RandomSource, size: Size) -> Array:
-    """Draw the point that attracts all bodies [length], shape [axis]."""
-    point = []
-    for axis in "xyz"[: size.dimension]:
-        coordinate = draw_between(rng, size, f"attractor_{axis}")
-        point.append(coordinate)
-    return np.array(point)
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
@@ -276,22 +232,17 @@ def draw_bodies(
         WorkFailedError: the bodies find no places apart from one another.
     """
     materials = _materials(size, scenario)
-    shapes = []
-    for material in materials:
-        shape = _draw_shape(rng, material, size, kinds)
-        shapes.append(shape)
+    shapes = [_draw_shape(rng, material, size, kinds) for material in materials]
     bodies = _place_apart(rng, size, shapes)
     measures = [shape.measure for shape in shapes]
     counts = _share_particles(size.particles, measures)
 
     # the attractor: velocity of each body = rate (point - centre) [length/s]
-    point = _draw_attractor(rng, size)
+    dimension = size.dimension
+    axes = "xyz"[:dimension]
+    point = np.array([draw_between(rng, size, f"attractor_{axis}") for axis in axes])
     rate = draw_between(rng, size, "attraction")
-    velocities = []
-    for body in bodies:
-        exact_velocity = rate * (point - body.centre)
-        velocity = quantise(exact_velocity)
-        velocities.append(velocity)
+    velocities = [quantise(rate * (point - body.centre)) for body in bodies]
 
     friction = 0.0
     if Material.LIQUID not in materials:
@@ -299,8 +250,7 @@ def draw_bodies(
 
     positions = []
     for body, count in zip(bodies, counts, strict=True):
-        position = sample_points(rng, body, count)
-        positions.append(position)
+        positions.append(sample_points(rng, body, count))
     names = [material.name.lower() for material in materials]
     parameters: dict[str, int | float | str] = {
         "pair": "-".join(names),
@@ -309,18 +259,13 @@ def draw_bodies(
     }
     for body_values in zip(_NAMES, bodies, measures, velocities, strict=False):
         parameters |= _body_parameters(*body_values)
-    dimension = size.dimension
-    affine_shape = (size.particles, dimension, dimension)
-    wall_shape = (2 * dimension, dimension)
-    body_velocity = np.stack(velocities)
-    body_material = np.array(materials, dtype=np.int8)
     return InitialState(
         position=np.concatenate(positions),
-        velocity=np.repeat(body_velocity, counts, axis=0),
-        affine=np.zeros(affine_shape),
-        material=np.repeat(body_material, counts),
+        velocity=np.repeat(np.stack(velocities), counts, axis=0),
+        affine=np.zeros((size.particles, dimension, dimension)),
+        material=np.repeat(np.array(materials, dtype=np.int8), counts),
         area=add_in_order(measures),
-        wall_velocity=np.zeros(wall_shape),
+        wall_velocity=np.zeros((2 * dimension, dimension)),
         friction=friction,
         parameters=parameters,
     )

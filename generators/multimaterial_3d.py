@@ -10,32 +10,27 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .constants import constants, draw_between
+from .constants import draw_between
 from .draws import RandomSource, draw_direction
-from .multimaterial import BodyShapes, draw_bodies
-from .solids import Ball, Block, Rod, Solid
+from .multimaterial import BodyShapes, draw_bodies, solver_parameters
+from .shapes import Ball, Block, Rod, Shape
 from .split import (
-    FreeSurface3DParameters,
-    FreeSurfaceParameters,
     InitialState,
 )
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-
-def solver_parameters(size: Size) -> FreeSurfaceParameters:
-    """Return the solver's constants at this size."""
-    return constants(FreeSurface3DParameters, size)
+__all__ = ["initial_state", "solver_parameters"]
 
 
-def _draw_rod(rng: RandomSource, size: Size, length: float) -> Solid:
+def _draw_rod(rng: RandomSource, size: Size, length: float) -> Shape:
     radius = size.value("rope_radius")
     axis = draw_direction(rng, 3)
     return Rod(length, radius, axis)
 
 
-def _draw_block(rng: RandomSource, size: Size, volume: float) -> Solid:
+def _draw_block(rng: RandomSource, size: Size, volume: float) -> Shape:
     along_x = draw_between(rng, size, "aspect")
     along_z = draw_between(rng, size, "aspect")
     aspects = (along_x, along_z)

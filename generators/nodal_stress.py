@@ -122,36 +122,27 @@ class NodalStress:
         self.layer_count = max(1, p.force_layers)
 
         self.cells = p.cells
-        tables = BoxTables(p.cells, periodic=box.periodic, no_slip=p.no_slip)
-        self.tables = tables
-        self.stride = tables.stride
-        image_signs = tables.images.sign
-        self.image_signs = image_signs.tolist()
-        image_count = len(self.image_signs)
-        self.image_numbers = tuple(range(image_count))
+        self.tables = BoxTables(p.cells, periodic=box.periodic, no_slip=p.no_slip)
+        self.stride = self.tables.stride
+        self.image_signs = self.tables.images.sign.tolist()
+        self.image_numbers = tuple(range(len(self.image_signs)))
 
         self.inv_dx = float(p.grid)
         self.dt = p.dt
         self.origin = p.origin  # coordinate of node 0 of each axis [cells]
         # smallest and largest coordinate of a particle along each axis
         inset = np.where(box.periodic, 0.0, _INSET * dx)
-        position_max = np.array(box.high) - inset
         self.position_min = (np.array(box.low) + inset).tolist()
-        self.position_max = position_max.tolist()
-        period = box.lengths
-        self.period = period.tolist()
+        self.position_max = (np.array(box.high) - inset).tolist()
+        self.period = box.lengths.tolist()
 
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
-        reach = _REACH[dimension]
-        speed_reach = reach * self.speed_bound
-        particles = self.particles
-        velocity_scale = fixed_point_scale(particles, speed_reach)
-        count_scale = fixed_point_scale(particles, JACOBIAN_BOUND)
-        self.velocity_scale = velocity_scale
-        self.count_scale = count_scale
-        self.velocity_unit = 1.0 / velocity_scale
-        self.count_unit = 1.0 / count_scale
-        self.cell_scale = velocity_scale * dx
+        speed_reach = _REACH[dimension] * self.speed_bound
+        self.velocity_scale = fixed_point_scale(self.particles, speed_reach)
+        self.count_scale = fixed_point_scale(self.particles, JACOBIAN_BOUND)
+        self.velocity_unit = 1.0 / self.velocity_scale
+        self.count_unit = 1.0 / self.count_scale
+        self.cell_scale = self.velocity_scale * dx
 
         # dt E / (2 rho dx): gain of velocity by a difference of Jbar over two cells
         self.pressure_factor = p.dt * p.modulus / (p.density * 2.0 * dx)
@@ -160,104 +151,87 @@ class NodalStress:
         self.shift_factor = -p.shift * dx * dx
         self.shift_bound = 0.1 * dx
 
-        self._make_stencils()
+        # The kernels unroll what follows.
+        # the rows of three nodes that a particle touches: steps along all but the last
+        # axis
+        self.row_axes = self.axes[:-1]
+        self.row_steps = tuple(itertools.product((-1, 0, 1), repeat=dimension - 1))
+        # one of each pair of opposite neighbours of a node; nearest first
+        pairs = []
+        for step in itertools.product((1, 0, -1), repeat=dimension):
+            if step > (0,) * dimension:
+                pairs.append(step)
+        self.pairs = tuple(sorted(pairs, key=_axis_count))
+        # the two of these differ along one axis only
+        self.nearest_pairs = self.pairs[:dimension]
+        # weight in a gradient of the difference of a pair, by the number of further
+        # axes along which the two differ
+        self.pair_weight = tuple(
+            0.75 ** (dimension - 1 - further) * 0.125**further for further in self.axes
+        )
+
         self._declare_fields()
         self._tree = self._place_fields()
         self._fill_tables()
-
-    def _make_stencils(self) -> None:
-        """List the rows that a particle touches, the pairs of a node's neighbours, and
-        the weights of the pairs in a gradient.
-
-        The kernels unroll them.
-        """
-        dimension = self.dimension
-        # the rows of three nodes that a particle touches: steps along all but the last
-        # axis
-        row_axes = dimension - 1
-        self.row_axes = tuple(range(row_axes))
-        row_steps = itertools.product((-1, 0, 1), repeat=row_axes)
-        self.row_steps = tuple(row_steps)
-
-        # one of each pair of opposite neighbours; nearest first
-        pairs = []
-        middle = (0,) * dimension
-        all_steps = itertools.product((1, 0, -1), repeat=dimension)
-        for step in all_steps:
-            if step > middle:
-                pairs.append(step)
-        pairs.sort(key=_axis_count)
-        self.pairs = tuple(pairs)
-        # the two of these differ along one axis only
-        self.nearest_pairs = self.pairs[:dimension]
-
-        # weight in a gradient of the difference of a pair, by the number of further
-        # axes along which the two differ
-        weights = []
-        for further in range(dimension):
-            weight = 0.75 ** (row_axes - further) * 0.125**further
-            weights.append(weight)
-        self.pair_weight = tuple(weights)
-        self.further_counts = tuple(range(1, dimension))
 
     def _declare_fields(self) -> None:
         """Name the fields; they have no memory yet."""
         # of each particle: its position [length], and the largest -J since the
         # advance began
-        self.x = _vector_field()
-        self.particle_state = _vector_field()  # v_p, J_p
+        self.x = vec4.field()
+        self.particle_state = vec4.field()  # v_p, J_p
         # state of a particle at rest
         self.at_rest = (0.0, 0.0, 0.0, 1.0)
         # v and r of the nodes, at the particle
-        self.grid_state = _vector_field()
+        self.grid_state = vec4.field()
         # derivative of the same along each axis
-        self.slopes = [_vector_field() for _ in self.axes]
+        self.slopes = [vec4.field() for _ in self.axes]
         # dt a and Jbar of the nodes, at the particle
-        self.grid_gain = _vector_field()
+        self.grid_gain = vec4.field()
         # largest abs(v) by component, and largest J, since the advance began
-        self.extremes = _vector_field()
+        self.extremes = vec4.field()
         # the three weights along each axis
-        self.weights = [_vector_field() for _ in self.axes]
+        self.weights = [vec4.field() for _ in self.axes]
         # offset from the middle node [cells], and the bits of the lowest node's number
-        self.stencil_place = _vector_field()
+        self.stencil_place = vec4.field()
 
         # of each node: n v, n J
-        self.sums = _sum_field()
+        self.sums = ti.Vector.field(LANES, i64)
         self.weight_sum = ti.field(i64)  # n
-        self.drag = _vector_field()  # what moving walls add to n v
-        self.node_state = _vector_field()  # v, r
-        self.node_jacobian = _number_field()  # Jbar
-        self.next_state = _vector_field()  # v, r after the forces
-        self.node_gain = _vector_field()  # dt a, Jbar
+        self.drag = vec4.field()  # what moving walls add to n v
+        self.node_state = vec4.field()  # v, r
+        self.node_jacobian = ti.field(f32)  # Jbar
+        self.next_state = vec4.field()  # v, r after the forces
+        self.node_gain = vec4.field()  # dt a, Jbar
         # largest absolute velocity component since the advance began
-        self.peak_speed = _number_field()
+        self.peak_speed = ti.field(f32)
         # 1 in the fluid, 0 inside an obstacle
-        self.fluid_mask = _number_field()
+        self.fluid_mask = ti.field(f32)
         # dt sigma, equal in all scenarios
-        self.fringe_damping = _number_field()
-        self.force_layer = _index_field()
+        self.fringe_damping = ti.field(f32)
+        self.force_layer = ti.field(i32)
         # n of three nodes in a row
-        self.row_sums = _sum_field()
+        self.row_sums = ti.Vector.field(LANES, i64)
 
         # of each scenario: nu dt / dx^2 and m / (rho dx^d)
-        self.diffusion_number = _number_field()
-        self.particle_volume = _number_field()
+        self.diffusion_number = ti.field(f32)
+        self.particle_volume = ti.field(f32)
         # centre of the obstacle, and the least distance from it [length]
-        self.obstacle = _vector_field()
-        self.stream = _vector_field()  # U
+        self.obstacle = vec4.field()
+        self.stream = vec4.field()  # U
 
         # tables, shape [ghost], [edge], [edge, image] and [interior]
-        self.ghost_node = _index_field()
-        self.ghost_source = _index_field()
-        self.ghost_sign = _vector_field()
-        self.edge_node = _index_field()
-        self.image_ghost = _index_field()
-        self.interior_node = _index_field()
+        self.ghost_node = ti.field(i32)
+        self.ghost_source = ti.field(i32)
+        self.ghost_sign = vec4.field()
+        self.edge_node = ti.field(i32)
+        self.image_ghost = ti.field(i32)
+        self.interior_node = ti.field(i32)
         # what walls and forces do now, shape [scenario, ghost], [scenario, edge,
         # image] and [scenario, layer]
-        self.ghost_drive = _vector_field()  # added to a ghost's v
-        self.image_drag = _vector_field()  # n v per particle
-        self.force_gain = _vector_field()  # dt f
+        self.ghost_drive = vec4.field()  # added to a ghost's v
+        self.image_drag = vec4.field()  # n v per particle
+        self.force_gain = vec4.field()  # dt f
 
     def _place_fields(self) -> Any:  # noqa: ANN401 (Taichi is untyped)
         """Give the fields their memory, each an array of its own."""
@@ -288,38 +262,27 @@ class NodalStress:
             self.obstacle,
             self.stream,
         )
-        tables = self.tables
         scenarios = self.scenarios
-        node_count = tables.node_count
-        ghost_count = len(tables.ghosts.node)
-        edge_count = len(tables.images.node)
-        image_shape = tables.images.ghost.shape
-        interior_shape = tables.interior.shape
-        particle_shape = (scenarios, self.particles)
+        node_count = self.tables.node_count
+        ghost_count = len(self.tables.ghosts.node)
+        edge_count = len(self.tables.images.node)
+        image_shape = self.tables.images.ghost.shape
         node_shape = (scenarios, node_count)
-        # Two more: a node counts the rows of the two nodes before it as well.
-        row_shape = (scenarios, node_count + 2)
-        drive_shape = (scenarios, ghost_count)
-        drag_shape = (scenarios, *image_shape)
-        force_shape = (scenarios, self.layer_count)
-        mask_shape = (1, 1)
-        if self.has_obstacle:
-            mask_shape = node_shape
-        fringe_count = 1
-        if self.has_fringe:
-            fringe_count = node_count
+        mask_shape = node_shape if self.has_obstacle else (1, 1)
+        fringe_count = node_count if self.has_fringe else 1
         return backend.place(
-            (particle_shape, particle_fields),
+            ((scenarios, self.particles), particle_fields),
             (node_shape, node_fields),
-            (row_shape, [self.row_sums]),
+            # Two more: a node counts the rows of the two nodes before it as well.
+            ((scenarios, node_count + 2), [self.row_sums]),
             ((ghost_count,), ghost_fields),
             ((edge_count,), [self.edge_node]),
             (image_shape, [self.image_ghost]),
-            (interior_shape, [self.interior_node]),
+            (self.tables.interior.shape, [self.interior_node]),
             ((node_count,), [self.force_layer]),
-            (drive_shape, [self.ghost_drive]),
-            (drag_shape, [self.image_drag]),
-            (force_shape, [self.force_gain]),
+            ((scenarios, ghost_count), [self.ghost_drive]),
+            ((scenarios, *image_shape), [self.image_drag]),
+            ((scenarios, self.layer_count), [self.force_gain]),
             ((scenarios,), scenario_fields),
             (mask_shape, [self.fluid_mask]),
             ((fringe_count,), [self.fringe_damping]),
@@ -327,30 +290,22 @@ class NodalStress:
 
     def _fill_tables(self) -> None:
         tables = self.tables
-        ghosts = tables.ghosts
-        images = tables.images
-        self.ghost_node.from_numpy(ghosts.node)
-        self.ghost_source.from_numpy(ghosts.source)
-        self.ghost_sign.from_numpy(ghosts.sign)
-        self.edge_node.from_numpy(images.node)
-        self.image_ghost.from_numpy(images.ghost)
+        self.ghost_node.from_numpy(tables.ghosts.node)
+        self.ghost_source.from_numpy(tables.ghosts.source)
+        self.ghost_sign.from_numpy(tables.ghosts.sign)
+        self.edge_node.from_numpy(tables.images.node)
+        self.image_ghost.from_numpy(tables.images.ghost)
         self.interior_node.from_numpy(tables.interior)
 
         # the layer of each node along y; ghosts belong to the nearest one
         row_count = self.cells[1]
-        last_row = row_count - 1
-        row_with_ghosts = tables.index[:, 1]
-        row = row_with_ghosts - 1
-        row = np.clip(row, 0, last_row)
-        layer_number = (row * self.layer_count // row_count).astype(np.int32)
-        self.force_layer.from_numpy(layer_number)
+        row = np.clip(tables.index[:, 1] - 1, 0, row_count - 1)
+        layer_number = row * self.layer_count // row_count
+        self.force_layer.from_numpy(layer_number.astype(np.int32))
 
         if self.has_fringe:
-            places = self._node_places()
-            x = places[:, 0]
-            rates = self.parameters.fringe_rates(x)
-            rounded_damping = (self.dt * rates).astype(np.float32)
-            self.fringe_damping.from_numpy(rounded_damping)
+            rates = self.parameters.fringe_rates(self._node_places()[:, 0])
+            self.fringe_damping.from_numpy((self.dt * rates).astype(np.float32))
 
     def _node_places(self) -> NDArray[np.float64]:
         """Return where the nodes lie [length], ghosts included, shape [node, axis]."""
@@ -358,44 +313,30 @@ class NodalStress:
 
     def move_walls(self, velocity: Singles) -> None:
         """Let walls slide [length/s], shape [scenario, 2 axis, axis]."""
-        drive = self.tables.ghost_drive(velocity)
-        drag = self.tables.image_drag(velocity)
-        self.ghost_drive.from_numpy(drive)
-        self.image_drag.from_numpy(drag)
+        self.ghost_drive.from_numpy(self.tables.ghost_drive(velocity))
+        self.image_drag.from_numpy(self.tables.image_drag(velocity))
 
     def apply_force(self, acceleration: Singles) -> None:
         """Let a force act [length/s^2], shape [scenario, layer, axis]."""
-        scenarios, layers, dimension = acceleration.shape
-        velocity_gain = np.float32(self.dt) * acceleration
-        shape = (scenarios, layers, LANES)
-        gain = np.zeros(shape, np.float32)
-        gain[..., :dimension] = velocity_gain
+        gain = np.zeros((*acceleration.shape[:2], LANES), np.float32)
+        gain[..., : self.dimension] = np.float32(self.dt) * acceleration
         self.force_gain.from_numpy(gain)
 
     def place_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Set the nodes that each scenario's obstacle holds at rest."""
         places = self._node_places()
-        node_count = len(places)
-        mask_shape = (self.scenarios, node_count)
-        disc_shape = (self.scenarios, LANES)
-        mask = np.empty(mask_shape, np.float32)
-        discs = np.zeros(disc_shape, np.float32)
-        inset = _INSET / self.inv_dx
+        mask = np.empty((self.scenarios, len(places)), np.float32)
+        discs = np.zeros((self.scenarios, LANES), np.float32)
         for s, obstacle in enumerate(obstacles):
-            centre = obstacle.centre
-            radius = obstacle.radius
-            is_solid = is_inside(places, centre, radius)
-            mask[s] = ~is_solid
-            disc = discs[s]
-            disc[: self.dimension] = centre
-            disc[3] = radius + inset
+            mask[s] = ~is_inside(places, obstacle.centre, obstacle.radius)
+            discs[s, : self.dimension] = obstacle.centre
+            discs[s, 3] = obstacle.radius + _INSET / self.inv_dx
         self.fluid_mask.from_numpy(mask)
         self.obstacle.from_numpy(discs)
 
     def set_stream(self, velocity: Singles) -> None:
         """Let the fringe draw to a velocity [length/s], shape [scenario, axis]."""
-        shape = (self.scenarios, LANES)
-        stream = np.zeros(shape, np.float32)
+        stream = np.zeros((self.scenarios, LANES), np.float32)
         stream[:, : self.dimension] = velocity
         self.stream.from_numpy(stream)
 
@@ -408,10 +349,8 @@ class NodalStress:
     @ti.func
     def clear(self, s: i32, n: i32) -> None:
         """Set a node's sums to zero."""
-        zero = ti.Vector.zero(i64, LANES)
-        self.sums[s, n] = zero
-        row = n + 2
-        self.row_sums[s, row] = zero
+        self.sums[s, n] = ti.Vector.zero(i64, LANES)
+        self.row_sums[s, n + 2] = ti.Vector.zero(i64, LANES)
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
@@ -420,31 +359,20 @@ class NodalStress:
         number = 0
         offset = vec3(0.0)
         for axis in ti.static(self.axes):
-            origin = self.origin[axis]
-            cells = self.cells[axis]
-            last_cell = cells - 1
-            coordinate = x[axis]
-            from_zero = coordinate * self.inv_dx  # [cells]
-            scaled = from_zero - origin
-            lowest = ti.cast(scaled - 0.5, i32)
+            scaled = x[axis] * self.inv_dx - self.origin[axis]  # [cells]
             # A periodic coordinate may round up to the end of its last cell.
-            lowest = ti.min(lowest, last_cell)
+            lowest = ti.min(ti.cast(scaled - 0.5, i32), self.cells[axis] - 1)
             f = scaled - ti.cast(lowest, f32)
             low, mid, high = spline_weights(f)
-            weights = vec4(low, mid, high, 0.0)
-            self.weights[axis][s, p] = weights
+            self.weights[axis][s, p] = vec4(low, mid, high, 0.0)
             offset[axis] = f - 1.0
-            stride = self.stride[axis]
-            number += lowest * stride
-        number_bits = ti.bit_cast(number, f32)
-        place = vec4(offset, number_bits)
-        self.stencil_place[s, p] = place
+            number += lowest * self.stride[axis]
+        self.stencil_place[s, p] = vec4(offset, ti.bit_cast(number, f32))
 
     @ti.func
     def lowest_node(self, place: vec4) -> i32:
         """Return the number of the lowest node of a particle's stencil."""
-        number_bits = place[3]
-        return node_number(number_bits, self.tables.node_count)
+        return node_number(place[3], self.tables.node_count)
 
     @ti.func
     def load_along(self, fields: Template, s: i32, p: i32) -> Value:
@@ -469,9 +397,7 @@ class NodalStress:
         across = weight_x[step[0] + 1]
         weights = across * weight_y
         if ti.static(self.has_z):
-            along_y = weight_y[step[1] + 1]
-            across = across * along_y
-            weights = across * weight_z
+            weights = across * weight_y[step[1] + 1] * weight_z
         return weights
 
     @ti.func
@@ -479,8 +405,7 @@ class NodalStress:
         """Return the number of the first node of a row."""
         number = lowest
         for axis in ti.static(self.row_axes):
-            stride = self.stride[axis]
-            number += (step[axis] + 1) * stride
+            number += (step[axis] + 1) * self.stride[axis]
         return number
 
     @ti.func
@@ -502,8 +427,7 @@ class NodalStress:
         step_y = slope_scale * slope_y
         step_z = slope_scale * slope_z
 
-        particle_state = self.particle_state[s, p]
-        at_middle = scale * particle_state - place.x * step_x
+        at_middle = scale * self.particle_state[s, p] - place.x * step_x
         at_middle = at_middle - place.y * step_y
         if ti.static(self.has_z):
             at_middle = at_middle - place.z * step_z
@@ -517,21 +441,16 @@ class NodalStress:
                 at_row = stepped(at_row, step_y, step[1])
                 row_step = step_z
             for k in ti.static(_ROW):
-                node = start + k
-                weight = weights[k]
-                at_node = stepped(at_row, row_step, k - 1)
-                share = weight * at_node
-                add_shifted(self.sums, s, node, share, self.atomic)
+                share = weights[k] * stepped(at_row, row_step, k - 1)
+                add_shifted(self.sums, s, start + k, share, self.atomic)
             # The fourth weight is 0, so that the fourth sum counts shifts.
-            last = start + 2
-            add_shifted(self.row_sums, s, last, weights, self.atomic)
+            add_shifted(self.row_sums, s, start + 2, weights, self.atomic)
 
     @ti.func
     def settle(self, s: i32, n: i32) -> None:
         """Take the shifts off a node's sums, and add up its n from three rows."""
         weight_sum, shifts = row_count(self.row_sums, s, n)
-        shifted_total = self.sums[s, n]
-        self.sums[s, n] = shifted_total - shifts
+        self.sums[s, n] = self.sums[s, n] - shifts
         self.weight_sum[s, n] = weight_sum
 
     @ti.func
@@ -550,14 +469,11 @@ class NodalStress:
             ghost = self.image_ghost[e, k]
             if ghost >= 0:
                 ghost_weight = self.weight_sum[s, ghost]
-                ghost_total = self.sums[s, ghost]
-                sign = self.image_sign(k)
-                total += sign * ghost_total
+                total += self.image_sign(k) * self.sums[s, ghost]
                 weight_sum += ghost_weight
                 if ti.static(self.has_walls):
                     ghost_count = from_fixed(ghost_weight, self.count_unit)
-                    drag_per_particle = self.image_drag[s, e, k]
-                    drag += drag_per_particle * ghost_count
+                    drag += self.image_drag[s, e, k] * ghost_count
         self.sums[s, n] = total
         self.weight_sum[s, n] = weight_sum
         self.drag[s, n] = drag
@@ -570,14 +486,11 @@ class NodalStress:
         weight_sum = self.weight_sum[s, n]
         if weight_sum > 0:
             total = self.sums[s, n]
-            jacobian_total = total[3]
             count = from_fixed(weight_sum, self.count_unit)
             received = from_fixed(total, self.velocity_unit)
-            drag = self.drag[s, n]
-            state = (received + drag) / count
+            state = (received + self.drag[s, n]) / count
             state[3] = count * particle_volume
-            jacobian_sum = from_fixed(jacobian_total, self.count_unit)
-            jacobian = jacobian_sum / count
+            jacobian = from_fixed(total[3], self.count_unit) / count
         self.node_state[s, n] = state
         self.node_jacobian[s, n] = jacobian
 
@@ -586,11 +499,9 @@ class NodalStress:
         """Fill a ghost node before the forces."""
         n = self.ghost_node[g]
         source = self.ghost_source[g]
-        sign = self.ghost_sign[g]
-        drive = self.ghost_drive[s, g]
-        state = self.node_state[s, source]
+        state = self.ghost_sign[g] * self.node_state[s, source]
         jacobian = self.node_jacobian[s, source]
-        self.node_state[s, n] = sign * state + drive
+        self.node_state[s, n] = state + self.ghost_drive[s, g]
         self.node_jacobian[s, n] = jacobian
 
     @ti.func
@@ -599,20 +510,17 @@ class NodalStress:
         n = self.ghost_node[g]
         source = self.ghost_source[g]
         sign = self.ghost_sign[g]
-        drive = self.ghost_drive[s, g]
-        state = self.next_state[s, source]
-        gain = self.node_gain[s, source]
-        ghost_gain = sign * gain
-        self.next_state[s, n] = sign * state + drive
-        self.node_gain[s, n] = ghost_gain
+        state = sign * self.next_state[s, source]
+        gain = sign * self.node_gain[s, source]
+        self.next_state[s, n] = state + self.ghost_drive[s, g]
+        self.node_gain[s, n] = gain
 
     @ti.func
     def neighbour(self, n: i32, step: Template, side: Template) -> i32:
         """Return the number of a node's neighbour, or of the opposite one."""
         number = n
         for axis in ti.static(self.axes):
-            stride = self.stride[axis]
-            number += side * step[axis] * stride
+            number += side * step[axis] * self.stride[axis]
         return number
 
     @ti.func
@@ -623,25 +531,17 @@ class NodalStress:
         for step in ti.static(self.pairs):
             ahead = self.neighbour(n, step, 1)
             behind = self.neighbour(n, step, -1)
-            jacobian_ahead = self.node_jacobian[s, ahead]
-            jacobian_behind = self.node_jacobian[s, behind]
-            rise = jacobian_ahead - jacobian_behind
+            rise = self.node_jacobian[s, ahead] - self.node_jacobian[s, behind]
             further = ti.static(_axis_count(step) - 1)
             for axis in ti.static(self.axes):
-                sum_before = rises[further, axis]
-                sum_after = stepped(sum_before, rise, step[axis])
-                rises[further, axis] = sum_after
+                rises[further, axis] = stepped(rises[further, axis], rise, step[axis])
 
         gradient = vec4(0.0)
-        nearest_weight = self.pair_weight[0]
         for axis in ti.static(self.axes):
-            nearest_rise = rises[0, axis]
-            slope = nearest_weight * nearest_rise
-            for further in ti.static(self.further_counts):
-                weight = self.pair_weight[further]
-                further_rise = rises[further, axis]
-                slope = slope + weight * further_rise
-            gradient[axis] = slope
+            gradient[axis] = self.pair_weight[0] * rises[0, axis]
+            for further in ti.static(self.axes[1:]):
+                weighted_rise = self.pair_weight[further] * rises[further, axis]
+                gradient[axis] = gradient[axis] + weighted_rise
         return gradient
 
     @ti.func
@@ -651,29 +551,21 @@ class NodalStress:
         for step in ti.static(self.nearest_pairs):
             ahead = self.neighbour(n, step, 1)
             behind = self.neighbour(n, step, -1)
-            state_ahead = self.node_state[s, ahead]
-            state_behind = self.node_state[s, behind]
-            neighbour_sum = neighbour_sum + (state_ahead + state_behind)
-        middle = self.node_state[s, n]
-        return neighbour_sum - 2.0 * self.dimension * middle
+            pair_sum = self.node_state[s, ahead] + self.node_state[s, behind]
+            neighbour_sum = neighbour_sum + pair_sum
+        return neighbour_sum - 2.0 * self.dimension * self.node_state[s, n]
 
     @ti.func
     def add_forces(self, s: i32, n: i32) -> None:
         """Add dt a = dt (E/rho) grad Jbar + dt nu lap v + dt f."""
         state = self.node_state[s, n]
-        density = state[3]
         gradient = self.pressure_gradient(s, n)
         laplacian = self.laplacian(s, n)
-        diffusion = self.diffusion_number[s]
-        gain = self.pressure_factor * gradient + diffusion * laplacian
+        gain = self.pressure_factor * gradient + self.diffusion_number[s] * laplacian
         if ti.static(self.has_force):
-            layer = self.force_layer[n]
-            force_gain = self.force_gain[s, layer]
-            gain = gain + force_gain
+            gain = gain + self.force_gain[s, self.force_layer[n]]
         if ti.static(self.has_fringe):
-            stream = self.stream[s]
-            damping = self.fringe_damping[n]
-            gain = gain + damping * (stream - state)
+            gain = gain + self.fringe_damping[n] * (self.stream[s] - state)
         v = state + gain
         if ti.static(self.has_obstacle):
             mask = self.fluid_mask[s, n]
@@ -683,13 +575,11 @@ class NodalStress:
         speed = ti.abs(v)
         peak = self.peak_speed[s, n]
         for axis in ti.static(self.axes):
-            component = speed[axis]
-            peak = largest(component, peak)
+            peak = largest(speed[axis], peak)
         self.peak_speed[s, n] = peak
         # The fourth lanes hold Jbar and r.
-        jacobian = self.node_jacobian[s, n]
-        gain[3] = jacobian
-        v[3] = density
+        gain[3] = self.node_jacobian[s, n]
+        v[3] = state[3]
         self.node_gain[s, n] = gain
         self.next_state[s, n] = v
 
@@ -716,12 +606,8 @@ class NodalStress:
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
             for k in ti.static(_ROW):
-                node = start + k
-                weight = weights[k]
-                node_state = self.next_state[s, node]
-                share = weight * node_state
-                node_gain = self.node_gain[s, node]
-                gain += weight * node_gain
+                share = weights[k] * self.next_state[s, start + k]
+                gain += weights[k] * self.node_gain[s, start + k]
                 state += share
                 moment_x = stepped(moment_x, share, step[0])
                 moment_y = stepped(moment_y, share, k - 1)
@@ -751,26 +637,15 @@ class NodalStress:
         moment_z = vec4(0.0)
         for step in ti.static(self.row_steps):
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
-            low_weight = weights[0]
-            mid_weight = weights[1]
-            high_weight = weights[2]
             start = self.row_start(lowest, step)
-            middle = start + 1
-            last = start + 2
+            low_share = weights[0] * self.next_state[s, start]
+            mid_share = weights[1] * self.next_state[s, start + 1]
+            high_share = weights[2] * self.next_state[s, start + 2]
+            row_state = low_share + mid_share + high_share
 
-            low_state = self.next_state[s, start]
-            mid_state = self.next_state[s, middle]
-            high_state = self.next_state[s, last]
-            low_share = low_weight * low_state
-            high_share = high_weight * high_state
-            row_state = low_share + mid_weight * mid_state + high_share
-
-            low_gain = self.node_gain[s, start]
-            mid_gain = self.node_gain[s, middle]
-            high_gain = self.node_gain[s, last]
-            low_gain_share = low_weight * low_gain
-            mid_gain_share = mid_weight * mid_gain
-            row_gain = low_gain_share + mid_gain_share + high_weight * high_gain
+            low_gain = weights[0] * self.node_gain[s, start]
+            mid_gain = weights[1] * self.node_gain[s, start + 1]
+            row_gain = low_gain + mid_gain + weights[2] * self.node_gain[s, start + 2]
 
             state += row_state
             gain += row_gain
@@ -795,16 +670,11 @@ class NodalStress:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
         grid_state = self.grid_state[s, p]
         grid_velocity = grid_state.xyz
-        grid_density = grid_state[3]
         grid_gain = self.grid_gain[s, p]
-        velocity_gain = grid_gain.xyz
-        grid_jacobian = grid_gain[3]
-        density = largest(grid_density, 0.5)
-        volume = 1.0 / density
+        volume = 1.0 / largest(grid_state[3], 0.5)
         old_state = self.particle_state[s, p]
-        old_velocity = old_state.xyz
         old_jacobian = old_state[3]
-        v = old_velocity + velocity_gain
+        v = old_state.xyz + grid_gain.xyz
         v = v + self.parameters.velocity_relaxation * (grid_velocity - v)
 
         shift = vec3(0.0)
@@ -814,66 +684,43 @@ class NodalStress:
         shift_strength = self.shift_factor * volume
         for axis in ti.static(self.axes):
             slope = self.slopes[axis][s, p]
-            velocity_slope = slope.xyz
-            density_slope = slope[3]
-            strain_rate = slope[axis]
-            wanted = shift_strength * density_slope
-            axis_shift = bounded(wanted, -shift_bound, shift_bound)
-            shift[axis] = axis_shift
-            axis_change = axis_shift * velocity_slope
+            shift[axis] = bounded(shift_strength * slope[3], -shift_bound, shift_bound)
+            axis_change = shift[axis] * slope.xyz
             if ti.static(axis == 0):
                 shift_change = axis_change
-                divergence = strain_rate
+                divergence = slope[axis]
             else:
                 shift_change = shift_change + axis_change
-                divergence = divergence + strain_rate
+                divergence = divergence + slope[axis]
         v = v + shift_change
 
         old_x = self.x[s, p]
         inside = vec3(0.0)
         for axis in ti.static(self.axes):
-            flow_speed = grid_velocity[axis]
-            axis_shift = shift[axis]
-            old_coordinate = old_x[axis]
-            target = old_coordinate + (self.dt * flow_speed + axis_shift)
-            coordinate = self.kept_inside(target, axis)
-            inside[axis] = coordinate
+            target = old_x[axis] + (self.dt * grid_velocity[axis] + shift[axis])
+            inside[axis] = self.kept_inside(target, axis)
         x = inside
         if ti.static(self.has_obstacle):
             # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
             x = self.kept_outside(s, inside)
 
         flowed = old_jacobian + self.dt * divergence * old_jacobian
-        jacobian = self.relaxed(flowed, old_jacobian, grid_jacobian, volume)
-        state = vec4(v, jacobian)
-        self.particle_state[s, p] = state
-        speed = ti.abs(v)
-        reached = vec4(speed, jacobian)
-        extremes = self.extremes[s, p]
-        extremes = largest(reached, extremes)
-        self.extremes[s, p] = extremes
-        old_minus_jacobian = old_x[3]
-        minus_jacobian = largest(-jacobian, old_minus_jacobian)
-        position = vec4(x, minus_jacobian)
-        self.x[s, p] = position
+        jacobian = self.relaxed(flowed, old_jacobian, grid_gain[3], volume)
+        self.particle_state[s, p] = vec4(v, jacobian)
+        reached = vec4(ti.abs(v), jacobian)
+        self.extremes[s, p] = largest(reached, self.extremes[s, p])
+        self.x[s, p] = vec4(x, largest(-jacobian, old_x[3]))
 
     @ti.func
     def hold(self, s: i32, p: i32) -> None:
         """Relax J_p of an obstacle's particle, which neither moves nor deforms."""
-        grid_state = self.grid_state[s, p]
-        grid_density = grid_state[3]
-        density = largest(grid_density, 0.5)
-        volume = 1.0 / density
-        grid_gain = self.grid_gain[s, p]
-        grid_jacobian = grid_gain[3]
-        no_slope = vec4(0.0)
+        volume = 1.0 / largest(self.grid_state[s, p][3], 0.5)
         for axis in ti.static(self.axes):
-            self.slopes[axis][s, p] = no_slope
-        old_state = self.particle_state[s, p]
-        old_jacobian = old_state[3]
+            self.slopes[axis][s, p] = vec4(0.0)
+        old_jacobian = self.particle_state[s, p][3]
+        grid_jacobian = self.grid_gain[s, p][3]
         jacobian = self.relaxed(old_jacobian, old_jacobian, grid_jacobian, volume)
-        state = vec4(0.0, 0.0, 0.0, jacobian)
-        self.particle_state[s, p] = state
+        self.particle_state[s, p] = vec4(0.0, 0.0, 0.0, jacobian)
 
     @ti.func
     def relaxed(
@@ -892,15 +739,11 @@ class NodalStress:
     def kept_outside(self, s: i32, target: vec3) -> Value:
         """Return a place, or the nearest on the obstacle's surface if inside."""
         obstacle = self.obstacle[s]
-        centre = obstacle.xyz
         radius = obstacle[3]
-        way = target - centre
+        way = target - obstacle.xyz
         square = way.x * way.x + way.y * way.y + way.z * way.z
-        radius_square = radius * radius
         # A place at the very centre has no nearest one; it stays.
-        is_near = square < radius_square
-        is_off_centre = square > 0.0
-        is_inside = is_near and is_off_centre
+        is_inside = square < radius * radius and square > 0.0
         way_out = (radius / ti.sqrt(ti.select(is_inside, square, 1.0)) - 1.0) * way
         return ti.select(is_inside, target + way_out, target)
 
@@ -911,9 +754,8 @@ class NodalStress:
         high = self.position_max[axis]
         x = target
         if ti.static(self.periodic[axis]):
-            period = self.period[axis]
-            x = ti.select(x >= high, x - period, x)
-            x = ti.select(x < low, x + period, x)
+            x = ti.select(x >= high, x - self.period[axis], x)
+            x = ti.select(x < low, x + self.period[axis], x)
             # The sum may round up to the end of the period; NaN becomes its start.
             x = ti.select(x < high, x, low)
         else:
@@ -924,21 +766,16 @@ class NodalStress:
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread."""
-        tables = self.tables
-        self._serial_substeps(
-            substeps,
-            self.particles,
-            self.parameters.particles,
-            tables.node_count,
-            len(tables.interior),
-            len(tables.images.node),
-            len(tables.ghosts.node),
-        )
+        self._serial_substeps(substeps, *self._counts())
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
+        self._parallel_substep(*self._counts())
+
+    def _counts(self) -> tuple[int, ...]:
+        """Return the numbers of particles, of those of the fluid, and of nodes."""
         tables = self.tables
-        self._parallel_substep(
+        return (
             self.particles,
             self.parameters.particles,
             tables.node_count,
@@ -974,13 +811,11 @@ class NodalStress:
             for e in range(edges):
                 self.add_images(0, e)
             for i in range(interior):
-                n = self.interior_node[i]
-                self.fold(0, n, particle_volume)
+                self.fold(0, self.interior_node[i], particle_volume)
             for g in range(ghosts):
                 self.mirror(0, g)
             for i in range(interior):
-                n = self.interior_node[i]
-                self.add_forces(0, n)
+                self.add_forces(0, self.interior_node[i])
             for g in range(ghosts):
                 self.mirror_forces(0, g)
             for p in range(particles):
@@ -1018,16 +853,13 @@ class NodalStress:
             self.add_images(s, e)
         ti.loop_config(parallelize=threads)
         for s, i in ti.ndrange(scenarios, interior):
-            n = self.interior_node[i]
-            particle_volume = self.particle_volume[s]
-            self.fold(s, n, particle_volume)
+            self.fold(s, self.interior_node[i], self.particle_volume[s])
         ti.loop_config(parallelize=threads)
         for s, g in ti.ndrange(scenarios, ghosts):
             self.mirror(s, g)
         ti.loop_config(parallelize=threads)
         for s, i in ti.ndrange(scenarios, interior):
-            n = self.interior_node[i]
-            self.add_forces(s, n)
+            self.add_forces(s, self.interior_node[i])
         ti.loop_config(parallelize=threads)
         for s, g in ti.ndrange(scenarios, ghosts):
             self.mirror_forces(s, g)
@@ -1044,9 +876,7 @@ class NodalStress:
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
-        fluid = self.parameters.particles
-        nodes = self.tables.node_count
-        self._restart_extremes(fluid, nodes)
+        self._restart_extremes(self.parameters.particles, self.tables.node_count)
 
     @ti.kernel
     def _restart_extremes(self, particles: i32, nodes: i32) -> Nothing:
@@ -1055,13 +885,9 @@ class NodalStress:
         ti.loop_config(serialize=is_serial)
         for s, p in ti.ndrange(scenarios, particles):
             state = self.particle_state[s, p]  # v_p, J_p
-            velocity = state.xyz
-            jacobian = state[3]
-            speed = ti.abs(velocity)
-            extremes = vec4(speed, jacobian)
-            self.extremes[s, p] = extremes
+            self.extremes[s, p] = vec4(ti.abs(state.xyz), state[3])
             # this lane keeps the largest -J
-            self.x[s, p][3] = -jacobian
+            self.x[s, p][3] = -state[3]
         ti.loop_config(serialize=is_serial)
         for s, n in ti.ndrange(scenarios, nodes):
             self.peak_speed[s, n] = 0.0
@@ -1069,25 +895,4 @@ class NodalStress:
 
 def _axis_count(step: tuple[int, ...]) -> int:
     """Return along how many axes a neighbour lies off."""
-    nonzero = [value for value in step if value != 0]
-    return len(nonzero)
-
-
-def _vector_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
-    """Return a field of vectors of four."""
-    return vec4.field()
-
-
-def _number_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
-    """Return a field of numbers."""
-    return ti.field(f32)
-
-
-def _index_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
-    """Return a field of numbers of nodes, ghosts or layers."""
-    return ti.field(i32)
-
-
-def _sum_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
-    """Return a field of fixed-point sums of vectors of four."""
-    return ti.Vector.field(LANES, i64)
+    return len(step) - step.count(0)

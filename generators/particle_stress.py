@@ -26,22 +26,17 @@ without it a settled liquid loses a fifth of its depth.
 from .constitutive import (
     corotated_stress,
     determinant,
-    hardening,
-    larger,
     liquid_stress,
     plastic_return,
-    smaller,
     viscous_stress,
 )
-from .free_surface_kernels import LIQUID, ROPE, SNOW, FreeSurfaceKernels, largest_of
+from .free_surface_kernels import LIQUID, SNOW, FreeSurfaceKernels
 from .language import f32, i32, i64, mat2, ti, vec2, vec4
 from .transfer import (
     Nothing,
     Template,
-    Value,
     accumulate,
     base_node,
-    bounded,
     from_fixed,
     masked,
     stencil,
@@ -51,49 +46,20 @@ from .transfer import (
 
 @ti.data_oriented
 class ParticleStress(FreeSurfaceKernels):
-    """Fields of a batch of scenarios and the kernels that advance them."""
+    """Fields of a batch of scenarios and the kernels that advance them.
+
+    P2G spreads v_x, v_y, 1, and J of liquid or 1. Nodes hold v_x, v_y, Jbar and r.
+    """
 
     dimension = 2
     reach = 64.0  # a violent impact reaches 2
     at_rest = (0.0, 0.0, 1.0, 1.0)
-
-    def _declare_fields(self) -> None:
-        """Name the fields; they have no memory yet.
-
-        P2G spreads v_x, v_y, 1, and J of liquid or 1. Slopes are those of v_x, v_y, r
-        and Jbar.
-        """
-        super()._declare_fields()
-        self.slope_x, self.slope_y = self.slopes
-        # of each particle: the deformation gradient of a solid [1]
-        self.deformation = mat2.field()
-        # rows of its stencil
-        self.first_row = vec4.field()
-        self.second_row = vec4.field()
-        self.third_row = vec4.field()
-        self.weight_rows = [self.first_row, self.second_row, self.third_row]
-        # first column of A, scaled, and two zeros
-        self.momentum_slope_x = vec4.field()
-        # second column
-        self.momentum_slope_y = vec4.field()
-        # v_x, v_y, r and Jbar of the nodes, at the particle
-        self.grid_state = vec4.field()
-
-        # of each node: n v_x, n v_y, n, n J
-        self.sums = ti.Vector.field(4, i64)
-        self.node_state = vec4.field()  # v_x, v_y, r, Jbar
+    lanes = 4
 
     def _particle_fields(self) -> tuple[ti.Field, ...]:
-        return (
-            self.deformation,
-            *self.weight_rows,
-            self.momentum_slope_x,
-            self.momentum_slope_y,
-            self.grid_state,
-        )
-
-    def _node_fields(self) -> tuple[ti.Field, ...]:
-        return self.sums, self.node_state
+        # the rows of the stencil
+        self.weight_rows = [vec4.field() for _ in range(3)]
+        return tuple(self.weight_rows)
 
     # The phases: each function is one phase at one particle or node.
 
@@ -101,97 +67,53 @@ class ParticleStress(FreeSurfaceKernels):
     def stress(self, s: i32, p: i32, c: mat2, solid: Template) -> mat2:
         """Return the Kirchhoff stress tau of a particle."""
         matter = self.matter[s, p]
-        kind = matter[0]
-        ratio = matter[1]
-
         # as if it were liquid
-        modulus = self.parameters.liquid_modulus
-        isotropic = liquid_stress(ratio, modulus)
-        first_row = vec2(isotropic, 0.0)
-        second_row = vec2(0.0, isotropic)
-        tau = mat2(first_row, second_row)
-        viscosity = self.liquid_viscosity
+        isotropic = liquid_stress(matter[1], self.parameters.liquid_modulus)
+        tau = mat2([isotropic, 0.0], [0.0, isotropic])
         if ti.static(solid):
-            mu, la = self.jelly
-            damping = self.solid_viscosity
-            if kind == ROPE:
-                mu, la = self.rope
-            if kind == SNOW:
-                exponent = self.parameters.snow_hardening
-                least_factor = self.parameters.snow_hardening_min
-                greatest_factor = self.parameters.snow_hardening_max
-                factor = hardening(ratio, exponent, least_factor, greatest_factor)
-                snow_mu, snow_la = self.snow
-                mu = snow_mu * factor
-                la = snow_la * factor
-                damping = 0.0
-            f = self.deformation[s, p]
-            elastic = corotated_stress(f, mu, la)
-            is_liquid = kind == LIQUID
-            tau = ti.select(is_liquid, tau, elastic)
-            viscosity = ti.select(is_liquid, viscosity, damping)
-        viscous = viscous_stress(c, viscosity)
-        return tau + viscous
+            mu, la = self.moduli(s, p)
+            elastic = corotated_stress(self.deformation(s, p), mu, la)
+            tau = ti.select(matter[0] == LIQUID, tau, elastic)
+        return tau + viscous_stress(c, self.viscosity(s, p, solid))
 
     @ti.func
     def velocity_gradient(self, s: i32, p: i32) -> mat2:
         """Return C of a particle."""
-        slope_x = self.slope_x[s, p]
-        slope_y = self.slope_y[s, p]
-        u_x = slope_x.x
-        u_y = slope_y.x
-        v_x = slope_x.y
-        v_y = slope_y.y
-        gradient_of_u = vec2(u_x, u_y)
-        gradient_of_v = vec2(v_x, v_y)
-        return mat2(gradient_of_u, gradient_of_v)
+        slope_x = self.slopes[0][s, p]
+        slope_y = self.slopes[1][s, p]
+        return mat2([slope_x.x, slope_y.x], [slope_x.y, slope_y.y])
+
+    @ti.func
+    def deformation(self, s: i32, p: i32) -> mat2:
+        """Return F of a particle."""
+        first = self.deformation_columns[0][s, p]
+        second = self.deformation_columns[1][s, p]
+        return mat2([first.x, second.x], [first.y, second.y])
+
+    @ti.func
+    def determinant(self, s: i32, p: i32) -> f32:
+        """Return det F of a particle."""
+        return determinant(self.deformation(s, p))
+
+    @ti.func
+    def divergence(self, s: i32, p: i32) -> f32:
+        """Return tr C of a particle."""
+        return self.slopes[0][s, p].x + self.slopes[1][s, p].y
 
     @ti.func
     def prepare(self, s: i32, p: i32, solid: Template) -> None:
         """Compute the stencil of a particle, and the slope A of what it carries."""
-        self.locate(s, p)
+        rows = stencil(self.x[s, p], self.inv_dx, self.width)
+        for i in ti.static(range(3)):
+            self.weight_rows[i][s, p] = rows[i]
         c = self.velocity_gradient(s, p)
-        tau = self.stress(s, p, c, solid)
-        a = self.dx * c - self.stress_factor * tau
-        self.keep_reach(s, p, a)
-
-        scaled = self.velocity_scale * a
-        first_column = scaled[:, 0]
-        second_column = scaled[:, 1]
-        slope_x = vec4(first_column, 0.0, 0.0)
-        slope_y = vec4(second_column, 0.0, 0.0)
-        self.momentum_slope_x[s, p] = slope_x
-        self.momentum_slope_y[s, p] = slope_y
-
-    @ti.func
-    def locate(self, s: i32, p: i32) -> None:
-        """Keep for P2G and G2P which nodes a particle touches, and the weights."""
-        position = self.x[s, p]
-        first, second, third = stencil(position, self.inv_dx, self.width)
-        self.first_row[s, p] = first
-        self.second_row[s, p] = second
-        self.third_row[s, p] = third
-
-    @ti.func
-    def keep_reach(self, s: i32, p: i32, a: mat2) -> None:
-        """Keep the largest abs(v) + abs(A o) of a particle in this advance."""
+        a = self.dx * c - self.stress_factor * self.stress(s, p, c, solid)
         # A node lies within 1.5 cells per axis.
-        state = self.particle_state[s, p]
-        velocity = state.xy
-        speed = ti.abs(velocity)
-        slope = ti.abs(a)
-        xx = slope[0, 0]
-        xy = slope[0, 1]
-        yx = slope[1, 0]
-        yy = slope[1, 1]
-        reach_x = speed.x + 1.5 * (xx + xy)
-        reach_y = speed.y + 1.5 * (yx + yy)
-        reach = largest_of(reach_x, reach_y)
-
-        extremes = self.extremes[s, p]
-        old_reach = extremes[3]
-        extremes[3] = larger(reach, old_reach)
-        self.extremes[s, p] = extremes
+        affine_speed = 1.5 * (ti.abs(a[:, 0]) + ti.abs(a[:, 1]))
+        self.keep_node_speed(s, p, affine_speed)
+        for axis in ti.static(self.axes):
+            column = self.velocity_scale * a[:, axis]
+            self.momentum_slopes[axis][s, p] = vec4(column, 0.0, 0.0)
 
     @ti.func
     def p2g(self, s: i32, p: i32) -> None:
@@ -202,26 +124,21 @@ class ParticleStress(FreeSurfaceKernels):
             self.count_scale,
             self.count_scale,
         )
-        state = self.particle_state[s, p]
-        at_particle = scale * state
+        at_particle = scale * self.particle_state[s, p]
         # what is added from one node to the next, along x and along y
-        step_x = self.momentum_slope_x[s, p]
-        step_y = self.momentum_slope_y[s, p]
-
+        step_x = self.momentum_slopes[0][s, p]
+        step_y = self.momentum_slopes[1][s, p]
         base, offset = base_node(self.weight_rows, s, p)
-        at_middle = at_particle - offset.x * step_x
-        at_middle = at_middle - offset.y * step_y
+        at_middle = at_particle - offset.x * step_x - offset.y * step_y
 
         for i in ti.static(range(3)):
             column = base + i * self.width
             at_column = stepped(at_middle, step_x, i - 1)
             for j in ti.static(range(3)):
                 at_node = stepped(at_column, step_y, j - 1)
-                node = column + j
                 # A weight at a time: a name for the row makes this loop slower.
-                weight = self.weight_rows[i][s, p][j]
-                share = weight * at_node
-                accumulate(self.sums, s, node, share, self.atomic)
+                share = self.weight_rows[i][s, p][j] * at_node
+                accumulate(self.sums, s, column + j, share, self.atomic)
 
     @ti.func
     def at(self, i: i32, j: i32) -> i32:
@@ -231,9 +148,7 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def clear(self, s: i32, i: i32, j: i32) -> None:
         """Set the sums of a node of scenario s to zero, before P2G adds to them."""
-        node = self.at(i, j)
-        zero = ti.Vector.zero(i64, 4)
-        self.sums[s, node] = zero
+        self.sums[s, self.at(i, j)] = ti.Vector.zero(i64, 4)
 
     @ti.func
     def update(
@@ -242,53 +157,23 @@ class ParticleStress(FreeSurfaceKernels):
         """Divide by n, add gravity, meet the walls; an empty node is at rest."""
         node = self.at(i, j)
         total = self.sums[s, node]
-        u = 0.0
-        v = 0.0
+        velocity = vec2(0.0)
         jacobian = 1.0
-        momentum_sum = total.xy
-        count_sum = total[2]
-        jacobian_sum = total[3]
-        if count_sum > 0:
-            momentum = from_fixed(momentum_sum, self.velocity_unit)
-            count = from_fixed(count_sum, self.count_unit)
-            count_times_jacobian = from_fixed(jacobian_sum, self.count_unit)
-            jacobian = count_times_jacobian / count
-            u = momentum.x / count
-            v = momentum.y / count
-            v = v - self.gravity_gain
-            u, v = self.contact(i, u, v, friction)
-            v, u = self.contact(j, v, u, friction)
-
-        mirrored_sum = self.mirrored_count(s, i, j)
-        mirrored_count = from_fixed(mirrored_sum, self.count_unit)
+        if total[2] > 0:
+            count = from_fixed(total[2], self.count_unit)
+            jacobian = from_fixed(total[3], self.count_unit) / count
+            velocity = from_fixed(total.xy, self.velocity_unit) / count
+            velocity[1] -= self.gravity_gain
+            velocity = self.contact(i, 0, velocity, friction)
+            velocity = self.contact(j, 1, velocity, friction)
+        mirrored_count = from_fixed(self.mirrored_count(s, i, j), self.count_unit)
         density = mirrored_count * particle_volume
-        state = vec4(u, v, density, jacobian)
-        self.node_state[s, node] = state
-
-    @ti.func
-    def contact(self, index: i32, normal: f32, tangential: f32, friction: f32) -> Value:
-        """Return the normal and tangential velocity behind the contact with a wall.
-
-        ``index`` counts nodes along the normal of the two walls across an axis.
-        """
-        new_normal = normal
-        new_tangential = tangential
-        if self.is_outward(index, normal):
-            impact_speed = ti.abs(normal)
-            sliding_speed = ti.abs(tangential)
-            divisor = larger(sliding_speed, 1e-9)
-            kept = 1.0 - friction * impact_speed / divisor
-            kept = larger(kept, 0.0)
-            new_normal = 0.0
-            new_tangential = tangential * kept
-        return new_normal, new_tangential
+        self.node_state[s, node] = vec4(velocity, jacobian, density)
 
     @ti.func
     def count_at(self, s: i32, i: i32, j: i32) -> i64:
         """Return n of a node, without its mirror images."""
-        node = self.at(i, j)
-        total = self.sums[s, node]
-        return total[2]
+        return self.sums[s, self.at(i, j)][2]
 
     @ti.func
     def mirrored_count(self, s: i32, i: i32, j: i32) -> i64:
@@ -311,104 +196,45 @@ class ParticleStress(FreeSurfaceKernels):
 
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
-        """Gather (v, r, Jbar) and their slopes."""
+        """Gather (v, Jbar, r) and their slopes."""
         state = vec4(0.0)
         # sums of w q o, along x and along y
         moment_x = vec4(0.0)
         moment_y = vec4(0.0)
-
         lowest, offset = base_node(self.weight_rows, s, p)
         base = masked(lowest, self.node_count)
         for i in ti.static(range(3)):
             weights = self.weight_rows[i][s, p]
             column = base + i * self.width
-            distance_x = (i - 1.0) - offset.x
             for j in ti.static(range(3)):
-                node = column + j
-                weight = weights[j]
-                node_state = self.node_state[s, node]
-                share = weight * node_state
-                share_x = distance_x * share
-                share_y = (j - 1.0 - offset.y) * share
+                share = weights[j] * self.node_state[s, column + j]
                 state += share
-                moment_x += share_x
-                moment_y += share_y
-
+                moment_x += (i - 1.0 - offset.x) * share
+                moment_y += (j - 1.0 - offset.y) * share
         slope_factor = 4.0 * self.inv_dx
         slope_y = slope_factor * moment_y
-        self.slope_x[s, p] = slope_factor * moment_x
-        self.slope_y[s, p] = slope_y
+        self.slopes[0][s, p] = slope_factor * moment_x
+        self.slopes[1][s, p] = slope_y
         self.grid_state[s, p] = state
 
     @ti.func
-    def flow(self, s: i32, p: i32, solid: Template) -> None:
-        """Move a particle; update J of a liquid or F of a solid."""
-        grid_state = self.grid_state[s, p]
-        grid_density = grid_state[2]
-        grid_jacobian = grid_state[3]
-        velocity = grid_state.xy
-        old_x = self.x[s, p]
-        old_position = old_x.xy
-        moved = old_position + self.dt * velocity
-        inside = bounded(moved, self.position_min, self.position_max)
-        x = vec4(inside, 0.0, 0.0)
-        self.x[s, p] = x
+    def deform(self, s: i32, p: i32) -> None:
+        """Update F of a solid with the velocity gradient, and Jp of snow.
 
+        Chosen, not branched upon: else LLVM makes no vector instructions.
+        """
         matter = self.matter[s, p]
-        kind = matter[0]
-        old_ratio = matter[1]
-        c = self.velocity_gradient(s, p)
-        stretch_rate_x = c[0, 0]
-        stretch_rate_y = c[1, 1]
-        divergence = stretch_rate_x + stretch_rate_y
-        j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
-        ratio = j
-        jacobian = j
-        spread_jacobian = j
-        if ti.static(solid):
-            # Chosen, not branched upon: else no vectors.
-            is_snow = kind == SNOW
-            is_liquid = kind == LIQUID
-            old_f = self.deformation[s, p]
-            trial = old_f + self.dt * (c @ old_f)
-            least_stretch = self.yield_low
-            greatest_stretch = self.yield_high
-            yielded, growth = plastic_return(trial, least_stretch, greatest_stretch)
-            f = ti.select(is_liquid, old_f, ti.select(is_snow, yielded, trial))
-            self.deformation[s, p] = f
-
-            jp_min = self.parameters.snow_jp_min
-            jp_max = self.parameters.snow_jp_max
-            jp = old_ratio * growth
-            jp = bounded(jp, jp_min, jp_max)
-            ratio = ti.select(is_liquid, j, ti.select(is_snow, jp, old_ratio))
-            solid_jacobian = determinant(f)
-            jacobian = ti.select(is_liquid, j, solid_jacobian)
-            spread_jacobian = ti.select(is_liquid, j, 1.0)
-        state = vec4(velocity, 1.0, spread_jacobian)
-        self.particle_state[s, p] = state
-
-        old_min = matter[2]
-        old_max = matter[3]
-        ratio_min = smaller(ratio, old_min)
-        ratio_max = larger(ratio, old_max)
-        new_matter = vec4(kind, ratio, ratio_min, ratio_max)
-        self.matter[s, p] = new_matter
-        speed = ti.abs(velocity)
-        self.keep_extremes(s, p, speed, jacobian)
-
-    @ti.func
-    def keep_extremes(self, s: i32, p: i32, speed: vec2, jacobian: f32) -> None:
-        """Keep the largest speed and the extremes of J in this advance."""
-        extremes = self.extremes[s, p]
-        old_speed = extremes[0]
-        old_least = extremes[1]
-        old_greatest = extremes[2]
-        fastest = largest_of(speed.x, speed.y)
-        extremes[0] = larger(fastest, old_speed)
-        extremes[1] = smaller(jacobian, old_least)
-        extremes[2] = larger(jacobian, old_greatest)
-        self.extremes[s, p] = extremes
+        is_snow = matter[0] == SNOW
+        is_liquid = matter[0] == LIQUID
+        old_f = self.deformation(s, p)
+        trial = old_f + self.dt * (self.velocity_gradient(s, p) @ old_f)
+        yielded, growth = plastic_return(trial, self.yield_low, self.yield_high)
+        f = ti.select(is_liquid, old_f, ti.select(is_snow, yielded, trial))
+        for axis in ti.static(self.axes):
+            self.deformation_columns[axis][s, p] = vec4(f[:, axis], 0.0, 0.0)
+        jp = self.grown_plastic_ratio(s, p, growth)
+        self.store_ratio(s, p, ti.select(is_snow, jp, matter[1]))
+        self.keep_jacobian(s, p, ti.select(is_liquid, matter[1], determinant(f)))
 
     # The drivers: the same phases in the same order.
 
@@ -432,24 +258,22 @@ class ParticleStress(FreeSurfaceKernels):
             particle_volume = self.particle_volume[0]
             friction = self.friction[0]
             first, end = self.touched_nodes(particles)
-            first_i = first[0]
-            first_j = first[1]
-            end_i = end[0]
-            end_j = end[1]
-            for i in range(first_i, end_i):
-                for j in range(first_j, end_j):
+            for i in range(first[0], end[0]):
+                for j in range(first[1], end[1]):
                     self.clear(0, i, j)
             for p in range(particles):
                 self.prepare(0, p, solid)
             for p in range(particles):
                 self.p2g(0, p)
-            for i in range(first_i, end_i):
-                for j in range(first_j, end_j):
+            for i in range(first[0], end[0]):
+                for j in range(first[1], end[1]):
                     self.update(0, i, j, particle_volume, friction)
             for p in range(particles):
                 self.g2p(0, p)
             for p in range(particles):
                 self.flow(0, p, solid)
+                if ti.static(solid):
+                    self.deform(0, p)
 
     @ti.kernel
     def _parallel_substep(self, solid: Template) -> Nothing:
@@ -457,9 +281,7 @@ class ParticleStress(FreeSurfaceKernels):
         scenarios = ti.static(self.scenarios)
         particles = ti.static(self.particles)
         # with the nodes behind the walls
-        first_node = ti.static(self.low - 1)
-        end_node = ti.static(self.high + 2)
-        nodes = ti.static((first_node, end_node))
+        nodes = ti.static((self.low - 1, self.high + 2))
         ti.loop_config(parallelize=threads)
         for s, i, j in ti.ndrange(scenarios, nodes, nodes):
             self.clear(s, i, j)
@@ -476,29 +298,5 @@ class ParticleStress(FreeSurfaceKernels):
         for s, p in ti.ndrange(scenarios, particles):
             self.g2p(s, p)
             self.flow(s, p, solid)
-
-    @ti.kernel
-    def restart_extremes(self) -> Nothing:
-        """Start an advance: the extremes are those of the present state.
-
-        They are the speed, the least J and the largest J of a particle. Its reach, the
-        fourth one, is 0 until it moves.
-        """
-        scenarios = ti.static(self.scenarios)
-        particles = ti.static(self.particles)
-        is_serial = ti.static(not self.atomic)
-        ti.loop_config(serialize=is_serial)
-        for s, p in ti.ndrange(scenarios, particles):
-            state = self.particle_state[s, p]
-            matter = self.matter[s, p]
-            kind = matter[0]
-            f = self.deformation[s, p]
-            jacobian = determinant(f)
-            if kind == LIQUID:
-                jacobian = state[3]
-
-            velocity = state.xy
-            speed = ti.abs(velocity)
-            fastest = largest_of(speed.x, speed.y)
-            extremes = vec4(fastest, jacobian, jacobian, 0.0)
-            self.extremes[s, p] = extremes
+            if ti.static(solid):
+                self.deform(s, p)

@@ -2,16 +2,15 @@
 
 A shape stands about the origin, in the plane or in space. Its distance function is
 negative inside, so that one definition says what the shape contains and how far it
-keeps from another. The shapes of the plane stand here, those of space in
-:mod:`.solids`.
+keeps from another.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +20,18 @@ from lagbench.errors import WorkFailedError
 from .draws import RandomSource, quantise, uniform
 
 __all__ = [
+    "Ball",
     "Blobs",
+    "Block",
     "Body",
     "Disc",
     "Rectangle",
     "Region",
+    "Rod",
     "Shape",
     "body_at",
     "check_room",
+    "cube_root",
     "place",
     "sample_points",
 ]
@@ -65,6 +68,25 @@ class Shape(Protocol):
         """Return the signed distance, negative inside [length], shape [point]."""
 
 
+def _length(components: Iterable[Array]) -> Array:
+    """Return the lengths of vectors, whose squares are added in this order."""
+    square = np.zeros(())
+    for component in components:
+        square = square + component * component
+    return np.sqrt(square)
+
+
+def _distance_from_faces(*beyond: Array) -> Array:
+    """Return the signed distance from a convex shape with right angles.
+
+    Args:
+        beyond: distances beyond its pairs of faces, negative between them [length].
+    """
+    inside = np.minimum(np.maximum.reduce(beyond), 0.0)
+    outside = _length([np.maximum(distance, 0.0) for distance in beyond])
+    return np.asarray(outside + inside)
+
+
 @dataclass(frozen=True)
 class Rectangle:
     """A rectangle whose length lies along a unit vector."""
@@ -77,8 +99,7 @@ class Rectangle:
     def of_area(cls, area: float, aspect: float) -> Rectangle:
         """Return the level rectangle of an area [length^2] and an aspect ratio [1]."""
         length = math.sqrt(area * aspect)
-        width = area / length
-        return cls(length, width)
+        return cls(length, area / length)
 
     @property
     def measure(self) -> float:
@@ -86,39 +107,33 @@ class Rectangle:
         return self.length * self.width
 
     @property
-    def reach(self) -> tuple[float, float]:
+    def reach(self) -> tuple[float, ...]:
         """Half the bounding box of the turned rectangle."""
         x, y = self.axis
-        c = abs(x)
-        s = abs(y)
-        width = c * self.length + s * self.width
-        height = s * self.length + c * self.width
+        width = abs(x) * self.length + abs(y) * self.width
+        height = abs(y) * self.length + abs(x) * self.width
         return 0.5 * width, 0.5 * height
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         c, s = self.axis
         x, y = position.T
-        # distances beyond the ends and beyond the sides, negative between them
         along = np.abs(c * x + s * y) - 0.5 * self.length
         across = np.abs(c * y - s * x) - 0.5 * self.width
-        inside = np.minimum(np.maximum(along, across), 0.0)
-        along = np.maximum(along, 0.0)
-        across = np.maximum(across, 0.0)
-        return np.asarray(np.sqrt(along * along + across * across) + inside)
+        return _distance_from_faces(along, across)
 
 
 @dataclass(frozen=True)
 class Disc:
     """A disc of a given radius [length]."""
 
+    dimension: ClassVar[int] = 2
     radius: float
 
     @classmethod
     def of_area(cls, area: float) -> Disc:
         """Return the disc that covers this area [length^2]."""
-        radius = math.sqrt(area / math.pi)
-        return cls(radius)
+        return cls(math.sqrt(area / math.pi))
 
     @property
     def measure(self) -> float:
@@ -126,14 +141,111 @@ class Disc:
         return math.pi * self.radius * self.radius
 
     @property
-    def reach(self) -> tuple[float, float]:
-        """The radius, twice."""
-        return self.radius, self.radius
+    def reach(self) -> tuple[float, ...]:
+        """The radius along each axis."""
+        return (self.radius,) * self.dimension
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
-        x, y = position.T
-        return np.asarray(np.sqrt(x * x + y * y) - self.radius)
+        return np.asarray(_length(position.T) - self.radius)
+
+
+class Ball(Disc):
+    """A ball of a given radius [length]."""
+
+    dimension = 3
+
+    @classmethod
+    def of_volume(cls, volume: float) -> Ball:
+        """Return the ball that fills this volume [length^3]."""
+        return cls(cube_root(volume / (4.0 / 3.0 * math.pi)))
+
+    @property
+    def measure(self) -> float:
+        """Four thirds of pi times the radius cubed."""
+        r = self.radius
+        return 4.0 / 3.0 * math.pi * r * r * r
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block whose edges lie along the axes."""
+
+    sides: tuple[float, float, float]  # extents along x, y and z [length]
+
+    @classmethod
+    def of_volume(cls, volume: float, aspects: tuple[float, float]) -> Block:
+        """Return the block of a volume [length^3] whose x and z are these multiples of
+        its height [1].
+        """
+        along_x, along_z = aspects
+        height = cube_root(volume / (along_x * along_z))
+        return cls((along_x * height, height, along_z * height))
+
+    @property
+    def measure(self) -> float:
+        """Product of the sides."""
+        width, height, depth = self.sides
+        return width * height * depth
+
+    @property
+    def reach(self) -> tuple[float, ...]:
+        """Half the sides."""
+        return tuple(0.5 * side for side in self.sides)
+
+    def distance(self, position: Array) -> Array:
+        """Return the exact signed distance."""
+        return _distance_from_faces(*(np.abs(position) - np.array(self.reach)).T)
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A round rod, that is a cylinder, whose length lies along a unit vector."""
+
+    length: float  # extent along 'axis' [length]
+    radius: float  # of its cross-section [length]
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)  # unit vector
+
+    @property
+    def measure(self) -> float:
+        """Pi times the radius squared times the length."""
+        return math.pi * self.radius * self.radius * self.length
+
+    @property
+    def reach(self) -> tuple[float, ...]:
+        """Half the bounding box of the turned rod."""
+        reaches = []
+        for component in self.axis:
+            sine = math.sqrt(max(0.0, 1.0 - component * component))
+            reaches.append(0.5 * self.length * abs(component) + self.radius * sine)
+        return tuple(reaches)
+
+    def distance(self, position: Array) -> Array:
+        """Return the exact signed distance."""
+        x, y, z = position.T
+        a, b, c = self.axis
+        height = a * x + b * y + c * z
+        square = x * x + y * y + z * z - height * height
+        along = np.abs(height) - 0.5 * self.length
+        across = np.sqrt(np.maximum(square, 0.0)) - self.radius
+        return _distance_from_faces(along, across)
+
+
+def cube_root(value: float) -> float:
+    """Return the cube root of a positive number by Newton's method.
+
+    Only + - * / are used, so that the result has the same bits on every x86-64 Linux
+    CPU.
+
+    >>> cube_root(27.0)
+    3.0
+    """
+    root = max(1.0, value)
+    while True:
+        smaller = root - (root * root * root - value) / (3.0 * root * root)
+        if not smaller < root:
+            return root
+        root = smaller
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from .full_box_parameters import FullBoxParameters
 from .split import (
     Device,
-    FreeSurface3DParameters,
     FreeSurfaceParameters,
     InitialState,
     SolverParameters,
@@ -78,7 +77,6 @@ class Solver(Protocol):
 
 IMPLEMENTATIONS: dict[type, tuple[str, str]] = {
     FreeSurfaceParameters: (".free_surface", "FreeSurface"),
-    FreeSurface3DParameters: (".free_surface_3d", "FreeSurface3D"),
     FullBoxParameters: (".full_box", "FullBox"),
 }
 """Module and class of the solver of each type of constants."""

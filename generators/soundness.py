@@ -56,19 +56,13 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     c^2 is K/rho in liquid and (lambda + 2 mu)/rho in solids.
     """
     p = parameters
-    jelly = wave_modulus(p.jelly_modulus, p.jelly_poisson)
-    snow = wave_modulus(p.snow_modulus, p.snow_poisson)
-    rope = wave_modulus(p.rope_modulus, p.rope_poisson)
     moduli = {
         Material.LIQUID: p.liquid_modulus,
-        Material.JELLY: jelly,
-        Material.SNOW: snow,
-        Material.ROPE: rope,
+        Material.JELLY: wave_modulus(p.jelly_modulus, p.jelly_poisson),
+        Material.SNOW: wave_modulus(p.snow_modulus, p.snow_poisson),
+        Material.ROPE: wave_modulus(p.rope_modulus, p.rope_poisson),
     }
-    speeds = {}
-    for material, modulus in moduli.items():
-        speeds[material] = math.sqrt(modulus / p.density)
-    return speeds
+    return {kind: math.sqrt(value / p.density) for kind, value in moduli.items()}
 
 
 def wave_modulus(young: float, poisson: float) -> float:
@@ -89,13 +83,9 @@ class SoundnessRecorder:
         self._parameters = parameters
         self._is_liquid = material == Material.LIQUID
         self._is_snow = material == Material.SNOW
-        speed_of_kind = sound_speeds(parameters)
-        particle_speeds = []
-        for kind in material:
-            sound_speed = speed_of_kind[Material(kind)]
-            particle_speeds.append(sound_speed)
+        speeds = sound_speeds(parameters)
         # of each particle [length/s], shape [particle]
-        self._sound_speed = np.array(particle_speeds)
+        self._sound_speed = np.array([speeds[Material(kind)] for kind in material])
         self._mach_counts = np.zeros(_BIN_COUNT, np.int64)
         self._mach_max = 0.0
         self._jacobian_counts = np.zeros(_BIN_COUNT, np.int64)
@@ -110,13 +100,9 @@ class SoundnessRecorder:
         speed = np.sqrt(np.square(velocity, dtype=np.float64).sum(axis=-1))
         mach = speed / self._sound_speed
         self._mach_max = max(self._mach_max, float(mach.max()))
-        mach_counts = _count_bins(mach)
-        self._mach_counts += mach_counts
-
-        liquid_jacobian = ratio[self._is_liquid]
-        exact_jacobian = liquid_jacobian.astype(np.float64)
-        jacobian_counts = _count_bins(exact_jacobian)
-        self._jacobian_counts += jacobian_counts
+        self._mach_counts += _count_bins(mach)
+        liquid_jacobian = ratio[self._is_liquid].astype(np.float64)
+        self._jacobian_counts += _count_bins(liquid_jacobian)
 
     def summary(self, least: Singles, greatest: Singles) -> FreeSurfaceSoundness:
         """Return what the frames and substeps so far have shown.
@@ -129,21 +115,20 @@ class SoundnessRecorder:
         liquid_jacobian_999 = 1.0
         if self._is_liquid.any():
             # the other tail: the start of the bin that holds it
-            end_of_bin = _quantile(self._jacobian_counts, 0.001)
-            liquid_jacobian_999 = end_of_bin - BIN
-        mach_999 = _quantile(self._mach_counts, 0.999)
+            liquid_jacobian_999 = _quantile(self._jacobian_counts, 0.001) - BIN
+        # without such particles the extremes are 1
         liquid_least = least[self._is_liquid]
         liquid_greatest = greatest[self._is_liquid]
         snow_least = least[self._is_snow]
         snow_greatest = greatest[self._is_snow]
         return FreeSurfaceSoundness(
-            mach_999=round(mach_999, 3),
+            mach_999=round(_quantile(self._mach_counts, 0.999), 3),
             mach_max=self._mach_max,
             liquid_jacobian_999=round(liquid_jacobian_999, 3),
-            liquid_jacobian_min=_least(liquid_least),
-            liquid_jacobian_max=_greatest(liquid_greatest),
-            snow_jp_min=_least(snow_least),
-            snow_jp_max=_greatest(snow_greatest),
+            liquid_jacobian_min=float(min(liquid_least, default=1.0)),
+            liquid_jacobian_max=float(max(liquid_greatest, default=1.0)),
+            snow_jp_min=float(min(snow_least, default=1.0)),
+            snow_jp_max=float(max(snow_greatest, default=1.0)),
             clamped_particles=self._count_clamped(least, greatest),
         )
 
@@ -164,29 +149,12 @@ class SoundnessRecorder:
 
 def _count_bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return how many values lie in each bin; the last one holds all that is beyond."""
-    place = values / BIN
-    place = np.minimum(place, _BIN_COUNT - 1)
+    place = np.minimum(values / BIN, _BIN_COUNT - 1)
     return np.bincount(place.astype(np.int64), minlength=_BIN_COUNT)
 
 
 def _quantile(counts: NDArray[np.int64], share: float) -> float:
     """Return the end of the first bin up to which a share of the values lies."""
     cumulative = np.cumsum(counts)
-    total = cumulative[-1]
-    first_bin = np.searchsorted(cumulative, share * total)
-    end = int(first_bin) + 1  # [bins]
+    end = int(np.searchsorted(cumulative, share * cumulative[-1])) + 1  # [bins]
     return end * BIN
-
-
-def _least(values: Singles) -> float:
-    """Return the smallest value, 1 without values."""
-    if not values.size:
-        return 1.0
-    return float(values.min())
-
-
-def _greatest(values: Singles) -> float:
-    """Return the largest value, 1 without values."""
-    if not values.size:
-        return 1.0
-    return float(values.max())

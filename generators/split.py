@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Device",
-    "FreeSurface3DParameters",
     "FreeSurfaceParameters",
     "InitialState",
     "Material",
@@ -58,10 +57,12 @@ class FreeSurfaceParameters:
     """Constants of the MLS-MPM solver for liquid, jelly, snow and rope.
 
     The equations stand in :mod:`.particle_stress`. The walls are free-slip and lie on
-    node ``wall`` and its mirror image.
+    node ``wall`` and its mirror image. In a cube, densities are per length^3 and moduli
+    in mass/(length s^2).
     """
 
     particles: int  # particles in one scenario
+    dimension: int = 2  # number of axes: 2 or 3
     grid: int  # cells across the unit box; the grid has grid + 1 nodes a side
     dt: float  # substep [s]
     wall: int  # index of the wall node at the low sides
@@ -91,15 +92,6 @@ class FreeSurfaceParameters:
     snow_hardening_max: float = 5.0  # upper cap of the hardening factor [1]
     snow_jp_min: float = 0.3  # lower bound of the plastic Jacobian Jp [1]
     snow_jp_max: float = 4.0  # upper bound of the plastic Jacobian Jp [1]
-
-
-@dataclass(frozen=True, kw_only=True)
-class FreeSurface3DParameters(FreeSurfaceParameters):
-    """Constants of the MLS-MPM solver for liquid, jelly, snow and rope in a cube.
-
-    The equations stand in :mod:`.particle_stress_3d`. Densities are per length^3,
-    moduli in mass/(length s^2).
-    """
 
 
 SolverParameters: TypeAlias = FreeSurfaceParameters | FullBoxParameters

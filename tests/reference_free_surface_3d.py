@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from reference_free_surface import (
+from reference_arithmetic import (
     HALF,
     ONE,
     TWO,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from reference_free_surface import (
+from reference_arithmetic import (
     HALF,
     ONE,
     TWO,

@@ -6,15 +6,14 @@ every scenario and of its mirror image (see :mod:`.train_library`). The particle
 the nearest few among them: each particle follows its partner in one of these analogs.
 How far a particle was from its partner is kept at first and fades away.
 
-How many frames after contact, and how many analogs, is chosen on train: each scenario
-is predicted from the others, and the choice with the least mean distance of clouds is
-taken. That is looked up in ``chosen.json``; see :func:`choose`.
+How many frames after contact, and how many analogs, was chosen on train: each scenario
+was predicted from the others, and the choice with the least mean distance of clouds was
+taken (``choose`` of this module at commit d1b9abca). It stands in ``chosen.json``.
 """
 
 from __future__ import annotations
 
 import functools
-import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,8 +24,6 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.registry import Size
-from lagbench.data.scenario import read_scenario
-from lagbench.metrics.frame import sliced_wasserstein2
 
 from .assignment import MOST_TOGETHER, assign_particles
 from .extrapolation import ballistic_positions
@@ -37,12 +34,10 @@ from .predictor import (
     Prediction,
     ReferencePredictor,
     falls,
-    given_in,
 )
 from .train_library import (
     StateLibrary,
     describe_state,
-    long_enough,
     mirrors_of,
     read_train_scenario,
     state_library,
@@ -63,18 +58,6 @@ class Choice:
 
     lag: int = 5  # frames from contact to the comparison
     analogs: int = 4  # analogs that the particles share
-
-
-CHOICES = tuple(
-    Choice(lag=lag, analogs=analogs)
-    for lag, analogs in itertools.product((0, 5, 10, 15), (1, 2, 3, 4, 6))
-)
-
-CHOSEN_SCENARIOS = 24
-"""Scenarios of train on which the choice is made, at most."""
-
-CHOSEN_STRIDE = 20
-"""Frames from one comparison with the truth to the next when the choice is made."""
 
 
 @functools.cache
@@ -204,7 +187,6 @@ def fly_then_follow(
     choice: Choice,
     *,
     library: StateLibrary | None,
-    without: int | None = None,
     divide: Division = divide_evenly,
     combine: Combination = follow_own_analog,
     most_together: int = MOST_TOGETHER,
@@ -215,7 +197,6 @@ def fly_then_follow(
         given: what is given of the scenario.
         choice: how long after contact, and how many analogs.
         library: states of train; without any the flight goes on.
-        without: a scenario of train that may not be looked at.
         divide: which particles follow which analog.
         combine: what the analogs say together.
         most_together: particles of a material that are assigned together, at most.
@@ -231,7 +212,6 @@ def fly_then_follow(
         flown,
         choice,
         library=library,
-        without=without,
         divide=divide,
         most_together=most_together,
     )
@@ -248,7 +228,6 @@ def _analogs_of(
     choice: Choice,
     *,
     library: StateLibrary | None,
-    without: int | None,
     divide: Division,
     most_together: int,
 ) -> list[FollowedAnalog]:
@@ -263,7 +242,7 @@ def _analogs_of(
         previous = ballistic_positions(given, flown - 1)
     velocity = given.box.displacement(previous, position)  # [length/frame]
     feature = describe_state(position, velocity, given.material)
-    states = library.nearest(feature, count=choice.analogs, without=without)
+    states = library.nearest(feature, count=choice.analogs)
     if not states:
         return []
     distances = np.linalg.norm(library.features[states] - feature, axis=1)
@@ -295,60 +274,6 @@ def predict(given: Given) -> Prediction:
     library = state_library(given.size, given.root, np.unique(given.material).tolist())
     for position in fly_then_follow(given, choice_for(given.size), library=library):
         yield position.astype("float32")
-
-
-def cloud_error(given: Given, choice: Choice, scenario: int) -> float:
-    """Return how far a scenario of train is from its prediction out of the others.
-
-    The mean over some frames of the sliced Wasserstein-2 distance, weighted by the
-    share of each material [length].
-    """
-    library = state_library(given.size, given.root, np.unique(given.material).tolist())
-    truth = read_train_scenario(given.size.path(given.root, scenario))
-    errors = []
-    predicted = fly_then_follow(given, choice, library=library, without=scenario)
-    for frame, position in zip(given.predicted_frames, predicted, strict=True):
-        if frame % CHOSEN_STRIDE:
-            continue
-        error = 0.0
-        for kind in np.unique(given.material):
-            members = given.material == kind
-            distance = sliced_wasserstein2(
-                position[members], truth.position[frame][members]
-            )
-            error += float(np.mean(members)) * distance
-        errors.append(error)
-    return float(np.mean(errors))
-
-
-def choose(size: Size, root: Path) -> Choice:
-    """Return the choice that predicts the scenarios of train best from one another.
-
-    Raises:
-        DataError: no scenario of train is as long as the task.
-    """
-    scenarios = long_enough(size)[:CHOSEN_SCENARIOS]
-    starts = {}
-    for scenario in scenarios:
-        with read_scenario(size.path(root, scenario)) as file:
-            starts[scenario] = given_in(file, size, root)
-    means = {}
-    for choice in CHOICES:
-        errors = []
-        for scenario, given in starts.items():
-            errors.append(cloud_error(given, choice, scenario))
-        means[choice] = float(np.mean(errors))
-    return min(CHOICES, key=lambda choice: means[choice])
-
-
-def record_choice(size: Size, root: Path, *, path: Path = CHOSEN_PATH) -> Choice:
-    """Choose for a data set, write the choice beside the others, and return it."""
-    choice = choose(size, root)
-    choices = json.loads(path.read_text("utf-8"))
-    key = f"{size.split}-{size.name}-v{size.major}"
-    choices[key] = {"lag": choice.lag, "analogs": choice.analogs}
-    path.write_text(json.dumps(choices, indent=1, sort_keys=True) + "\n", "utf-8")
-    return choice
 
 
 PREDICTOR = ReferencePredictor(

@@ -290,40 +290,47 @@ def linear_field(points: Floats, values: Floats) -> Field:
 def fitted_field(points: Floats, values: Floats) -> Field:
     """Return the field that a linear function of the nearest points has.
 
-    The function is fitted by weighted least squares to :data:`NEAREST` points, with
-    weights of the inverse squared distance. There is nothing to triangulate, which in
-    three dimensions takes 40 times as long as a reading.
+    It is fitted to :data:`NEAREST` points (:func:`fit_linear`). There is nothing to
+    triangulate, which in three dimensions takes 40 times as long as a reading.
     """
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
-    neighbour_count = min(NEAREST, len(points))
-    tiny = np.finfo(np.float64).tiny
 
     def field(at: Floats) -> Floats:
-        neighbours = tree.query(at, k=neighbour_count)
-        distance = np.asarray(neighbours[0])  # shape [place, neighbour]
-        nearest = np.asarray(neighbours[1])
-        farthest = distance.max(axis=1)[:, None]
-        weight = 1.0 / (distance**2 + 1e-6 * farthest**2 + tiny)
-
-        # The linear function has the value 1 and the way as its basis.
-        way = points[nearest] - at[:, None]  # shape [place, neighbour, axis]
-        place_count = len(at)
-        one = np.ones((place_count, neighbour_count, 1))
-        basis = np.concatenate([one, way], axis=2)
-        weighted = weight[..., None] * basis
-        matrix = np.einsum("nki,nkj->nij", weighted, basis)
-        right = np.einsum("nki,nkj->nij", weighted, values[nearest])
-
-        # A little on the diagonal, for points that lie in one plane.
-        size = np.trace(matrix, axis1=1, axis2=2)
-        identity = np.eye(basis.shape[2])
-        matrix += 1e-12 * size[:, None, None] * identity
-        solution = np.linalg.solve(matrix, right)
-        return np.asarray(solution[:, 0])
+        distance, nearest = tree.query(at, k=min(NEAREST, len(points)))
+        way = points[nearest] - at[:, None]
+        return fit_linear(np.asarray(distance), way, values[nearest])[:, 0]
 
     return field
+
+
+def fit_linear(distance: Floats, way: Floats, values: Floats) -> Floats:
+    """Return the linear functions that fit values around some places.
+
+    By least squares, with weights of the inverse squared distance.
+
+    Args:
+        distance: from each place to its neighbours, the nearest first [length], shape
+            [place, neighbour].
+        way: to the neighbours [length], shape [place, neighbour, axis].
+        values: at the neighbours, shape [place, neighbour, component].
+
+    Returns:
+        Value and gradient at each place, shape [place, 1 + axis, component].
+    """
+    tiny = np.finfo(np.float64).tiny
+    weight = 1.0 / (distance**2 + 1e-6 * distance[:, -1:] ** 2 + tiny)
+    one = np.ones((*way.shape[:2], 1))
+    basis = np.concatenate([one, way], axis=2)
+    weighted = weight[..., None] * basis
+    matrix = np.einsum("nki,nkj->nij", weighted, basis)
+    right = np.einsum("nki,nkj->nij", weighted, values)
+
+    # A little on the diagonal, for points that lie in one plane.
+    size = np.trace(matrix, axis1=1, axis2=2)
+    matrix += 1e-12 * size[:, None, None] * np.eye(basis.shape[2])
+    return np.asarray(np.linalg.solve(matrix, right))
 
 
 def with_wall_images(

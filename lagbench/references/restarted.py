@@ -52,6 +52,7 @@ from .predictor import (
     Kind,
     Prediction,
     ReferencePredictor,
+    fit_linear,
     fitted_velocity,
 )
 from .staggered import StaggeredGrid
@@ -398,8 +399,7 @@ def local_fit(
 ) -> tuple[Floats, Floats]:
     """Return velocity [length/s] and velocity gradient [1/s] at some places.
 
-    A linear function of the nearest particles, fitted by least squares with weights of
-    the inverse squared distance.
+    They are those of a linear function of the nearest particles.
 
     Args:
         given: what is given of the scenario: its box.
@@ -415,17 +415,8 @@ def local_fit(
     neighbour_count = min(NEAREST, len(position))
     found = tree.query(box.tree_points(at), k=neighbour_count)
     distance, nearest = map(np.asarray, found)
-    weight = 1.0 / (distance**2 + 1e-6 * distance[:, -1:] ** 2)
     way = box.displacement(at[:, None], position[nearest])
-    one = np.ones((*way.shape[:2], 1))
-    basis = np.concatenate([one, way], axis=2)
-    matrix = np.einsum("nki,nk,nkj->nij", basis, weight, basis)
-    right = np.einsum("nki,nk,nkc->nic", basis, weight, velocity[nearest])
-
-    # A little on the diagonal, for particles that lie in one plane.
-    size = np.trace(matrix, axis1=1, axis2=2)
-    matrix += 1e-12 * size[:, None, None] * np.eye(basis.shape[2])
-    solution = np.linalg.solve(matrix, right)
+    solution = fit_linear(distance, way, velocity[nearest])
     return solution[:, 0], np.swapaxes(solution[:, 1:], 1, 2)
 
 

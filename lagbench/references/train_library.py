@@ -169,23 +169,19 @@ class StateLibrary:
     frames: NDArray[np.intp]  # its frame, shape [state]
     features: Floats  # see :func:`describe_state`, shape [state, feature]
 
-    def nearest(
-        self, feature: Floats, *, count: int, without: int | None = None
-    ) -> list[int]:
+    def nearest(self, feature: Floats, *, count: int) -> list[int]:
         """Return the nearest states of different mirrored scenarios, the nearest first.
 
         Args:
             feature: what :func:`describe_state` says of the state that is compared.
             count: states to return, at most.
-            without: a scenario that is left out.
         """
         distance = np.sum((self.features - feature) ** 2, axis=1)
         chosen: list[int] = []
         seen = set()
         for state in np.argsort(distance, kind="stable"):
-            scenario = int(self.scenarios[state])
-            image = (scenario, int(self.mirrors[state]))
-            if scenario == without or image in seen:
+            image = (int(self.scenarios[state]), int(self.mirrors[state]))
+            if image in seen:
                 continue
             seen.add(image)
             chosen.append(int(state))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from box_scenarios import (
     after,
     box,
     loaded,
-    parameters,
     scenario,
 )
 from numpy.testing import assert_allclose
@@ -41,33 +39,6 @@ def with_velocity(
         velocity=quantise(velocity),
         affine=quantise(affine),
     )
-
-
-def cells_of_vortex(
-    constants: FullBoxParameters,
-    state: InitialState,
-) -> tuple[Any, Any]:
-    """Return velocity and gradient of u = sin kx cos ky, v = -cos kx sin ky, k =
-    pi/L.
-    """
-    low, high = box(constants)
-    k = np.pi / (high - low)
-    x, y = k * (state.position - low).T
-    sin_x = np.sin(x)
-    cos_x = np.cos(x)
-    sin_y = np.sin(y)
-    cos_y = np.cos(y)
-    velocity = np.stack([sin_x * cos_y, -cos_x * sin_y], axis=1)
-    straight = cos_x * cos_y
-    across = sin_x * sin_y
-    matrix = np.array(
-        [
-            [straight, -across],
-            [across, -straight],
-        ]
-    )
-    gradient = k * matrix.transpose(2, 0, 1)
-    return velocity, gradient
 
 
 def test_a_regular_lattice_stays_at_rest() -> None:
@@ -101,87 +72,6 @@ def test_transfers_conserve_momentum() -> None:
     total_speed = np.abs(state.velocity).sum()
     momentum = moved.sum(axis=0)
     assert_allclose(momentum, before, rtol=0, atol=1e-6 * total_speed)
-
-
-def test_a_vortex_decays_as_navier_stokes_says() -> None:
-    """The free-slip vortex sin kx cos ky is a solution with amplitude exp(-2 nu k^2
-    t).
-    """
-    exact = {
-        "velocity_relaxation": 0.0,
-        "density_coupling": 0.002,
-        "shift": 0.002,
-    }
-    constants = parameters(
-        particles=4900,
-        grid=32,
-        dt=2e-3,
-        no_slip=False,
-        **exact,
-    )
-    state = scenario(constants, seed=2, viscosity=5e-3)
-    shape, gradient = cells_of_vortex(constants, state)
-    state = with_velocity(state, 0.05 * shape, 0.05 * gradient)
-    solver = loaded(constants, [state])
-    solver.advance(2000)
-    position = solver.position()[0]
-    moved = dataclasses.replace(state, position=position)
-    shape, _ = cells_of_vortex(constants, moved)
-    velocity = solver.velocity()[0]
-    projection = np.sum(velocity * shape)
-    amplitude = projection / np.sum(shape**2)
-    low, high = box(constants)
-    wave_number = np.pi / (high - low)
-    decay_rate = 2.0 * 5e-3 * wave_number**2
-    time = 2000 * 2e-3
-    expected = 0.05 * np.exp(-decay_rate * time)
-    assert amplitude == pytest.approx(expected, rel=0.003)
-
-
-def test_energy_falls_when_the_lid_rests() -> None:
-    """Walls at rest do no work: kinetic energy falls from every 25 substeps to the
-    next.
-    """
-    constants = parameters(particles=2500, grid=32, dt=2e-3)
-    state = scenario(constants, seed=3, viscosity=1e-3)
-    shape, gradient = cells_of_vortex(constants, state)
-    low, high = box(constants)
-    share = (state.position - low) / (high - low)
-    phase = np.pi * share
-    envelope = np.sin(phase).prod(axis=1)
-    velocity = 0.1 * envelope[:, None] * shape
-    moving = with_velocity(state, velocity, 0.0 * gradient)
-    solver = loaded(constants, [moving])
-    energies = []
-    for _ in range(24):
-        solver.advance(25)
-        velocity = solver.velocity().astype(np.float64)
-        energies.append(np.sum(velocity**2))
-    assert np.all(np.diff(energies) < 0.0)
-    assert energies[-1] < 0.9 * energies[0]
-
-
-def test_jacobian_stays_near_one() -> None:
-    """Away from the lid's corners J stays within 2 % while the lid drives the flow."""
-    constants = parameters(particles=2500, grid=32, dt=2e-3)
-    walls = (0.0, 0.0, 0.0, 0.1)
-    state = scenario(constants, seed=4, walls=walls)
-    solver = loaded(constants, [state])
-    solver.advance(2000)
-    x, y = solver.position()[0].T
-    jacobian = solver.jacobian()[0]
-    low, high = box(constants)
-    reach = 5.0 / constants.grid
-    is_at_side = np.abs(x - 0.5) > 0.5 - low - reach
-    corner = (y > high - reach) & is_at_side
-    compression = jacobian[~corner] - 1.0
-    assert np.abs(compression).max() < 0.02
-    health = solver.health()[0]
-    assert health.finite
-    assert health.jacobian_min <= jacobian.min()
-    assert health.jacobian_max >= jacobian.max()
-    fastest = np.abs(solver.velocity()).max()
-    assert fastest <= health.max_speed <= 0.12
 
 
 # by 90 degrees: left, right <- top, bottom

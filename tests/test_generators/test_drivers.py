@@ -15,7 +15,6 @@ import pytest
 from box_scenarios import (
     ALL_LIDS,
     FREE_SLIP,
-    INERT,
     NO_SLIP,
     after,
     loaded,
@@ -55,56 +54,12 @@ def test_drivers_give_the_same_bits(threads: int) -> None:
         np.testing.assert_equal(own, after(constants, [state], 450))
 
 
-@pytest.mark.slow
-def test_threads_lose_no_contribution() -> None:
-    """Two threads that add 20,000 particles to the same nine nodes, 100 times, lose
-    none of them.
-    """
-    state = scenario(INERT)
-    everywhere = np.ones_like(state.position)
-    crowd = [
-        dataclasses.replace(
-            state,
-            position=0.5 * everywhere,
-            velocity=0.25 * everywhere,
-        )
-    ]
-    threaded = after(INERT, crowd, 100, device=Device.PARALLEL, threads=2)
-    np.testing.assert_equal(threaded, after(INERT, crowd, 100))
-
-
 def test_frames_do_not_matter() -> None:
     """450 substeps in one call and in calls of 50 give the same bits."""
     states = [scenario(NO_SLIP, seed=6, speed=0.4, walls=ALL_LIDS)]
     np.testing.assert_equal(
         after(NO_SLIP, states, *[50] * 9), after(NO_SLIP, states, 450)
     )
-
-
-@pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
-def test_the_order_of_particles_does_not_matter(device: Device) -> None:
-    """Particles in another order move in the same way, bit by bit, over 450
-    substeps.
-    """
-    constants, copies = (FREE_SLIP, 1) if device is Device.CPU else (NO_SLIP, 2)
-    state = scenario(constants, seed=7, speed=0.4, viscosity=0.0)
-    order = np.random.default_rng(8).permutation(constants.particles)
-    arrays = {
-        name: getattr(state, name)[order] for name in ("position", "velocity", "affine")
-    }
-    shuffled = dataclasses.replace(state, **arrays)
-    straight = after(constants, [state], 450)
-    mixed = after(constants, [shuffled] * copies, 450, device=device)
-    for copy in range(copies):
-        np.testing.assert_array_equal(
-            straight["grid_velocity"][0], mixed["grid_velocity"][copy]
-        )
-        for name in ("position", "velocity", "jacobian"):
-            np.testing.assert_array_equal(
-                straight[name][0][order],
-                mixed[name][copy],
-                err_msg=name,
-            )
 
 
 def test_what_the_runtime_cannot_do_is_refused() -> None:

@@ -12,7 +12,6 @@ from lagbench.references.staggered import (
     Forcing,
     StaggeredGrid,
     Velocity,
-    fill_gaps,
     interpolate,
     poisson_modes,
 )
@@ -272,17 +271,6 @@ def test_the_cavity_agrees_with_ghia() -> None:
     assert_allclose(profile, u, atol=0.012)
 
 
-def test_a_thin_periodic_box_is_the_flat_cavity() -> None:
-    flat = lid_driven(cells=10, solid=False)
-    solid = lid_driven(cells=10, solid=True)
-    for component in range(2):
-        solid_component = solid[component]
-        for layer in range(2):
-            values = solid_component[..., layer]
-            assert_allclose(values, flat[component], atol=1e-12)
-    assert_allclose(solid[2], 0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("periodic", [True, False])
 def test_the_projection_keeps_nothing_of_a_gradient_and_all_of_the_rest(
@@ -393,30 +381,6 @@ def test_carried_particles_stay_on_their_streamlines() -> None:
             wall_velocity=NO_WALLS,
         )
     assert_allclose(stream(position), start, atol=0.01)
-
-
-def test_gaps_are_filled_from_their_edges() -> None:
-    weight = np.array(
-        [
-            [1.0, 0.0, 0.0],
-            [2.0, 0.0, 4.0],
-        ]
-    )
-    values = np.array(
-        [
-            [1.0, 9.0, 9.0],
-            [3.0, 9.0, 7.0],
-        ]
-    )
-    expected = [
-        [1.0, 1.0, 7.0],
-        [3.0, 5.0, 7.0],
-    ]
-    filled = fill_gaps(weight * values, weight)
-    assert_allclose(filled, expected)
-    nothing = np.zeros_like(weight)
-    empty = fill_gaps(nothing, nothing)
-    np.testing.assert_array_equal(empty, 0.0)
 
 
 def test_layers_are_driven_apart() -> None:

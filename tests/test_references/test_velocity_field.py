@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lagbench.references.predictor import fitted_field, linear_field, velocity_field
+from lagbench.references.predictor import fitted_field, velocity_field
 
 Floats = NDArray[np.float64]
 
@@ -57,13 +57,3 @@ def test_the_fit_converges_as_fast_as_the_triangles() -> None:
         return float(np.sqrt(np.mean(difference**2)))
 
     assert error(20) < error(10) / 3.0
-
-
-def test_two_dimensions_keep_their_triangles() -> None:
-    """The field of a plane is the one between Delaunay triangles, bit for bit."""
-    points = scattered(200, 2)
-    velocities = np.cos(points)
-    places = scattered(30, 2, seed=7)
-    field = velocity_field(points, velocities)
-    expected = linear_field(points, velocities)(places)
-    np.testing.assert_array_equal(field(places), expected)

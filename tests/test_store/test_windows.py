@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ from scenario_factory import frames_of, make_key, write_scenario
 from torch.utils.data import DataLoader
 
 import lagbench
-from lagbench import torch as lagbench_torch
 from lagbench.baselines.rollout import scenario_batch, scenario_paths
 from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import read_yaml
@@ -176,18 +174,6 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
             assert window.origin is None
             number += 1
     assert number == WINDOWS
-
-
-def test_windows_have_the_first_frame_on_request(train: Open) -> None:
-    data = train()
-    with_origin = train(origin=True)
-    assert len(with_origin) == WINDOWS
-    for number in range(WINDOWS):
-        window = with_origin[number]
-        first_frame = stored_frames(window.scenario)[0]
-        assert_array_equal(window.origin, first_frame)
-        expected = data[number].position
-        assert torch.equal(window.position, expected)
 
 
 def test_a_window_has_materials_and_velocities_of_walls(train: Open) -> None:
@@ -414,30 +400,6 @@ def test_memory_is_bounded(train: Open, limit: int) -> None:
         assert frame.base is None
 
 
-def list_open_scenarios() -> set[Path]:
-    """Return the descriptors of this process that lead to scenario files."""
-    descriptors = Path("/proc/self/fd").iterdir()
-    scenarios = set()
-    for path in descriptors:
-        if path.resolve().suffix == ".nc":
-            scenarios.add(path)
-    return scenarios
-
-
-def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With one file open at a time, others are opened anew."""
-    before = list_open_scenarios()
-    monkeypatch.setattr(store_windows, "OPEN_FILES", 1)
-    data = train(cache_bytes=0)
-    numbers = [0, 40, 60]  # one window of each scenario
-    for number in numbers + numbers:
-        scenario, _ = data.place(number)
-        assert data[number].scenario == scenario
-        assert len(data.store._open_scenarios) == 1
-        newly_open = list_open_scenarios() - before
-        assert len(newly_open) <= 1
-
-
 def test_every_epoch_draws_every_window_once(train: Open) -> None:
     """Epochs are different orders of all windows; seed and epoch alone decide them."""
     data = train()
@@ -527,66 +489,6 @@ def test_ranks_share_out_one_order(train: Open) -> None:
         assert len(sampler) == share
         of_rank = order[rank::3]
         assert list(sampler) == of_rank[:share]
-
-
-def test_one_rank_draws_what_two_ranks_have_left(train: Open) -> None:
-    data = train()
-    alone = WindowSampler(data, seed=1)
-    order = alone.order(0).tolist()
-    of_two = WindowSampler(data, seed=1, rank=1, ranks=2)
-    assert len(next_of(iter(of_two), 5)) == 5
-    alone.load_state_dict(of_two.state_dict())
-    assert list(alone) == order[10:]
-
-
-def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With room for one pool, an epoch reads hardly more frames than there are.
-
-    Without a pool it would read each frame seven times.
-    """
-    # A run of 8 windows of 7 frames has 14 frames.
-    run = 8
-    run_frames = 14
-    runs_of_a_pool = 3
-    largest_frame = 11 * 8  # bytes
-    monkeypatch.setattr(lagbench_torch, "RUN", run)
-    data = train(cache_bytes=runs_of_a_pool * run_frames * largest_frame)
-    pool_bytes = runs_of_a_pool * run_frames * data.frame_bytes
-    monkeypatch.setattr(lagbench_torch, "POOL_BYTES", pool_bytes)
-    frames_read: list[int] = []
-    read = store_windows.FrameStore._read
-
-    def read_and_count(
-        store: store_windows.FrameStore,
-        opened: store_windows.ScenarioHandle,
-        scenario: int,
-        start: int,
-        stop: int,
-    ) -> None:
-        frames_read.extend(range(start, stop))
-        read(store, opened, scenario, start, stop)
-
-    monkeypatch.setattr(store_windows.FrameStore, "_read", read_and_count)
-    order = list(WindowSampler(data, seed=0))
-    assert sorted(order) == list(range(WINDOWS))
-    windows_of_a_pool = runs_of_a_pool * run
-    for start in range(0, WINDOWS, windows_of_a_pool):
-        pool = order[start : start + windows_of_a_pool]
-        scenarios = {data.place(number)[0] for number in pool}
-        assert len(scenarios) <= 3
-    for number in order:
-        data[number]
-    # 79 windows at 14/8 frames, and a few more of shorter runs.
-    assert len(frames_read) <= 2 * WINDOWS
-
-
-def test_a_pickled_data_set_takes_no_files_and_frames_along(train: Open) -> None:
-    data = train()
-    position = data[0].position
-    copied = pickle.loads(pickle.dumps(data))
-    assert copied.store.cached_bytes == 0
-    assert len(copied.store._open_scenarios) == 0
-    assert torch.equal(copied[0].position, position)
 
 
 @pytest.mark.filterwarnings(
