@@ -8,9 +8,7 @@ one scenario.
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -181,8 +179,11 @@ class ScenarioBatch:
         self._is_free_surface = isinstance(
             self.solver.parameters, FreeSurfaceParameters
         )
-        with self._scenario_names():
-            self.solver.load(self.states)
+        self.solver.names = [
+            f"{size.split} {size.name}, scenario {scenario}"
+            for scenario in job.scenarios
+        ]
+        self.solver.load(self.states)
         # extremes that each scenario has gone through so far
         self.extremes = self.solver.health()
 
@@ -228,19 +229,11 @@ class ScenarioBatch:
         ratio: Singles = self._volume_ratio[index]
         return ratio
 
-    def displace(self, offset: Singles) -> None:
-        """Add an offset to the positions [length], which are kept in the box.
-
-        Shape [scenario, particle, axis].
-        """
-        self.solver.displace(offset)
-
     def _advance_to(self, substep: int) -> None:
         """Advance to a substep."""
         while self._substep < substep:
             count = min(self._stride, substep - self._substep)
-            with self._scenario_names():
-                self.solver.advance(count)
+            self.solver.advance(count)
             self._substep += count
             running_count = self._update_extremes()
             self._report(count * running_count)
@@ -263,23 +256,6 @@ class ScenarioBatch:
                 jacobian_max=max(widest.jacobian_max, health.jacobian_max),
             )
         return running_count
-
-    @contextmanager
-    def _scenario_names(self) -> Iterator[None]:
-        """Put a scenario's id into errors of the solver, which knows its index only."""
-        ids = self.job.scenarios
-        size = self.job.size
-
-        def name_scenario(match: re.Match[str]) -> str:
-            return f"scenario {ids[int(match[1])]}"
-
-        try:
-            yield
-        except (WorkFailedError, UsageError) as error:
-            place = re.sub(r"scenario (\d+)", name_scenario, error.where or "")
-            raise type(error)(
-                error.text, where=f"{size.split} {size.name}, {place}"
-            ) from error
 
 
 @functools.lru_cache(maxsize=1)

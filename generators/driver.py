@@ -90,6 +90,8 @@ class Driver(ABC, Generic[Parameters]):
         self.parameters: Parameters = parameters
         self.device = device
         self.scenarios = scenarios
+        # of each scenario, for messages
+        self.names: Sequence[str] = [f"scenario {i}" for i in range(scenarios)]
         threads = backend.start(device, scenarios=scenarios, threads=threads)
         self._kernels = self._compile(device is not Device.CPU, threads)
         self._substeps = 0
@@ -208,7 +210,7 @@ class Driver(ABC, Generic[Parameters]):
             f"the simulation blew up: got {'; '.join(broken.values())}, expected "
             f"{'; '.join(broken)}; a smaller dt (a larger substeps_per_frame), a "
             "softer material, a smaller viscosity or smaller velocities",
-            where=f"scenario {index}, {span}",
+            where=f"{self.names[index]}, {span}",
         )
 
     def _drive(self, end: int) -> int:
@@ -286,7 +288,7 @@ class Driver(ABC, Generic[Parameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         """Refuse a state that the kernels cannot start from."""
-        where = f"scenario {index}"
+        where = self.names[index]
         count = self.parameters.particles
         dimension = self.dimension
         shapes = {

@@ -109,7 +109,7 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
             raise UsageError(
                 "a free surface knows no viscosity of a scenario, no moving wall, "
                 "body force, obstacle or stream; leave them out of the initial state",
-                where=f"scenario {index}",
+                where=self.names[index],
             )
 
     def _start(self, states: Sequence[InitialState]) -> None:

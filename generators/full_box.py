@@ -167,7 +167,7 @@ class FullBox(Driver[FullBoxParameters]):
         super()._check_state(index, state)
         p = self.parameters
         box = p.box
-        where = f"scenario {index}"
+        where = self.names[index]
         if state.friction != 0.0:
             raise UsageError(
                 "a full box knows no friction; leave it out of the initial state",

@@ -298,7 +298,7 @@ def measure_predictability(
                 offsets[:] = 0.0
                 scenario = job.scenarios[index]
                 offsets[index] = draw_perturbation(size, scenario, len(offsets[index]))
-                batch.displace(offsets)
+                batch.solver.displace(offsets)
             elif frame >= input_frames:
                 position, _ = batch.frame(index)
                 recorded_position = position[batch.recorded[index]]

@@ -46,6 +46,8 @@ class Solver(Protocol):
     def parameters(self) -> SolverParameters:
         """Constants that the scenarios share."""
 
+    names: Sequence[str]  # of each scenario, for messages
+
     def load(self, states: Sequence[InitialState]) -> None:
         """Start one scenario per state; as many states as the solver has scenarios."""
 

@@ -205,14 +205,8 @@ def state_library(
     """
     kinds = tuple(sorted(int(kind) for kind in materials))
     key = (size.folder(root), kinds)
-    if key not in _libraries:
-        _libraries[key] = _build_library(size, root, kinds)
-    return _libraries[key]
-
-
-def _build_library(
-    size: Size, root: Path, kinds: tuple[int, ...]
-) -> StateLibrary | None:
+    if key in _libraries:
+        return _libraries[key]
     scenarios = []
     mirror_numbers = []
     frames = []
@@ -231,11 +225,13 @@ def _build_library(
                 mirror_numbers.append(number)
                 frames.append(frame)
                 features.append(state)
-    if not features:
-        return None
-    return StateLibrary(
-        np.array(scenarios),
-        np.array(mirror_numbers),
-        np.array(frames),
-        np.array(features),
-    )
+    library: StateLibrary | None = None
+    if features:
+        library = StateLibrary(
+            np.array(scenarios),
+            np.array(mirror_numbers),
+            np.array(frames),
+            np.array(features),
+        )
+    _libraries[key] = library
+    return library

@@ -15,7 +15,7 @@ from object_stores import Store, holding
 from trajectories import straight_runs
 
 import lagbench
-from lagbench.errors import DataError, LagbenchError, UsageError
+from lagbench.errors import DataError, LagbenchError
 from lagbench.exchange import adopt, download
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
@@ -207,24 +207,6 @@ def test_a_line_that_stays_broken_is_given_up(server: Mirror, here: Path) -> Non
         download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
     assert caught.value.where == f"{server.url}/own/full/v1/{FIRST}"
     assert server.count(FIRST) == objects.ATTEMPTS
-
-
-@pytest.mark.parametrize(
-    "address",
-    [
-        "http://[::1",
-        "http:///data",
-        "s3://",
-        "s3:///prefix",
-        "file://",
-        "data/folder",
-    ],
-)
-def test_what_is_no_address(here: Path, address: str) -> None:
-    """No store is asked."""
-    with pytest.raises(UsageError) as caught:
-        download("own", root=here, mirror=address, or_generate=False)
-    assert caught.value.where == address
 
 
 @pytest.mark.slow
