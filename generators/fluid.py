@@ -84,10 +84,8 @@ def _draw_blobs(rng: RandomSource, area: float, size: Size) -> Blobs:
     for _ in range(size.value("blob_count")):
         distance = uniform(rng, least_distance, greatest_distance)
         x, y = draw_direction(rng, 2)
-        centre = (distance * x, distance * y)
-        centres.append(centre)
-    cells = size.value("blob_cells")
-    return Blobs.of_area(area, np.array(centres), cells=cells)
+        centres.append((distance * x, distance * y))
+    return Blobs.of_area(area, np.array(centres), cells=size.value("blob_cells"))
 
 
 def _draw_splash(rng: RandomSource, body: Body, position: Array, size: Size) -> Array:
@@ -103,20 +101,16 @@ def _draw_splash(rng: RandomSource, body: Body, position: Array, size: Size) -> 
     blob_count = size.value("blob_count")
     blob_velocities = normal(rng, size.value("blob_speed"), (blob_count, 2))
     softening = size.value("blob_softening")
-    softening_square = softening * softening
     from_body_centre = position - body.centre
-    particle_count = len(position)
     total = np.zeros_like(position)
-    weights = np.zeros((particle_count, 1))
+    weights = np.zeros((len(position), 1))
     for centre, velocity in zip(body.shape.centres, blob_velocities, strict=True):
         x, y = (from_body_centre - np.array(centre)).T
-        inverse = 1.0 / (x * x + y * y + softening_square)
-        weight = inverse[:, None]  # shape [particle, 1]
+        weight = (1.0 / (x * x + y * y + softening * softening))[:, None]
         total = total + weight * velocity
         weights = weights + weight
-    mean_velocity = total / weights
     noise = normal(rng, size.value("particle_speed"), position.shape)
-    return mean_velocity + noise
+    return total / weights + noise
 
 
 def _start_region(size: Size, start: str) -> Region:
@@ -126,9 +120,7 @@ def _start_region(size: Size, start: str) -> Region:
     margin = size.value("margin")
     least = low + margin
     most = high - margin
-    horizontal = (max(left, least), min(right, most))
-    vertical = (max(bottom, least), min(top, most))
-    return horizontal, vertical
+    return (max(left, least), min(right, most)), (max(bottom, least), min(top, most))
 
 
 def _draw_column(rng: RandomSource, size: Size, number: int) -> InitialState:
@@ -142,10 +134,8 @@ def _draw_column(rng: RandomSource, size: Size, number: int) -> InitialState:
     x = low + half_width
     if number // 2 % 2 == 1:
         x = high - half_width
-    y = low + half_height
-    body = body_at(shape, x, y)
-    sampled = sample_points(rng, body, size.particles)
-    position = np.clip(sampled, low, high)
+    body = body_at(shape, x, low + half_height)
+    position = np.clip(sample_points(rng, body, size.particles), low, high)
     return _liquid_at(
         size,
         body,
@@ -171,16 +161,14 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     start = _START[family]
     area = draw_between(rng, size, area_range)
     shape = _draw_shape(rng, family, area, size)
-    region = _start_region(size, start)
-    body = place(rng, shape, region)
+    body = place(rng, shape, _start_region(size, start))
 
     horizontal_speeds, vertical_speeds = ranges(size, f"{start}_velocity")
     velocity_x = uniform(rng, *horizontal_speeds)
     velocity_y = uniform(rng, *vertical_speeds)
     position = sample_points(rng, body, size.particles)
     splash = _draw_splash(rng, body, position, size)
-    body_velocity = np.array([velocity_x, velocity_y])
-    velocity = quantise(body_velocity + splash)
+    velocity = quantise(np.array([velocity_x, velocity_y]) + splash)
     return _liquid_at(
         size,
         body,

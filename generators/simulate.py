@@ -59,23 +59,6 @@ OUTCOMES = ("active_frames",)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationDiagnostics:
-    """What one simulated scenario went through; its file and the manifest state it."""
-
-    start_frame: int  # frames simulated before frame 0
-    kinetic_energy_first: float  # sum of m v^2 / 2 at frame 0
-    kinetic_energy_last: float  # the same at the last frame
-    kinetic_energy_max: float  # the largest of any frame
-    kinetic_energy_mean: float  # the mean over frames
-    # last over largest; small where the motion has died down
-    energy_last_over_max: float
-    max_speed: float  # largest velocity component at any substep [length/s]
-    cfl: float  # cells that this speed crosses per substep [1]
-    jacobian_min: float  # smallest J of any particle at any substep [1]
-    jacobian_max: float  # largest J of any particle at any substep [1]
-
-
-@dataclass(frozen=True, kw_only=True)
 class SimulatedScenario:
     """A scenario that was simulated and written."""
 
@@ -191,13 +174,12 @@ def simulate(job: SimulationJob, report: Report) -> list[SimulatedScenario]:
                 recorders[index].add(velocity, volume_ratio)
 
         for index, writer in enumerate(writers):
-            diagnostics = _diagnose(
+            facts = _facts_of(
                 size,
                 batch.states[index],
                 energies=energies[index],
                 extremes=batch.extremes[index],
             )
-            facts = asdict(diagnostics)
             if recorders:
                 writer.state(active_frames=active_frames(energies[index], size.task))
                 solver = cast("FreeSurface", batch.solver)
@@ -230,26 +212,30 @@ def _kinetic_energy(velocity: Singles, mass: float) -> float:
     return 0.5 * mass * math.fsum(squares.tolist())
 
 
-def _diagnose(
+def _facts_of(
     size: Size, state: InitialState, *, energies: Sequence[float], extremes: Health
-) -> SimulationDiagnostics:
-    """Return what a scenario went through, of its kinetic energies frame by frame."""
+) -> dict[str, int | float]:
+    """Return what a scenario went through; its file and the manifest state it."""
     largest = max(energies)
-    last_over_max = 0.0
+    last_over_max = 0.0  # small where the motion has died down
     if largest > 0.0:
         last_over_max = energies[-1] / largest
-    return SimulationDiagnostics(
-        start_frame=state.start_frame,
-        kinetic_energy_first=energies[0],
-        kinetic_energy_last=energies[-1],
-        kinetic_energy_max=largest,
-        kinetic_energy_mean=math.fsum(energies) / len(energies),
-        energy_last_over_max=last_over_max,
-        max_speed=extremes.max_speed,
-        cfl=extremes.max_speed * size.dt * size.grid,  # the same at any refinement
-        jacobian_min=extremes.jacobian_min,
-        jacobian_max=extremes.jacobian_max,
-    )
+    return {
+        "start_frame": state.start_frame,  # frames simulated before frame 0
+        # sums of m v^2 / 2: at frame 0, at the last frame, the largest and the mean
+        "kinetic_energy_first": energies[0],
+        "kinetic_energy_last": energies[-1],
+        "kinetic_energy_max": largest,
+        "kinetic_energy_mean": math.fsum(energies) / len(energies),
+        "energy_last_over_max": last_over_max,
+        # largest velocity component at any substep [length/s]
+        "max_speed": extremes.max_speed,
+        # cells that this speed crosses per substep [1], the same at any refinement
+        "cfl": extremes.max_speed * size.dt * size.grid,
+        # extremes of J of any particle at any substep [1]
+        "jacobian_min": extremes.jacobian_min,
+        "jacobian_max": extremes.jacobian_max,
+    }
 
 
 def draw_perturbation(size: Size, scenario: int, particles: int) -> Singles:
