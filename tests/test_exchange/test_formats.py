@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from lagbench.baselines.train import train
 from lagbench.errors import DataError, UnreadableFileError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
+from lagbench.exchange.names import name_trajectory
+from lagbench.exchange.readers import Reading, list_sources
 from lagbench.scoring.score import score
 
 RECIPE = """format: 1
@@ -138,6 +141,24 @@ def test_datasets_are_adopted_without_files(tmp_path: Path) -> None:
     )
     assert own.scenarios == again.scenarios == {"train": 1, "valid": 1, "test": 1}
     assert own.materials == (0, 1)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".nc"])
+def test_positions_stay_in_the_file_until_they_are_read(
+    tmp_path: Path, suffix: str
+) -> None:
+    """Of 8 MB not one is in memory before frames are asked for."""
+    path = tmp_path / f"run{suffix}"
+    position = np.zeros((200, 5000, 2), np.float32)
+    dataset_of(position).drop_vars("id").to_netcdf(path)
+    (source,) = list_sources(path, Reading(positions="position")).sources
+    tracemalloc.start()
+    trajectory = name_trajectory(source.open(), "run", {})
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    trajectory.close()
+    assert trajectory.frames == 200
+    assert peak < 1 << 20
 
 
 @pytest.mark.slow
