@@ -342,8 +342,8 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     # nearly always in truth; NaN is not inside either
     is_all_inside = x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
     if box.is_periodic or not is_all_inside:
-        is_inside = np.where(box.periodic, np.isfinite(x), (x >= 0.0) & (x <= 1.0))
-        is_inside = is_inside.all(axis=1)
+        is_between = (x >= 0.0) & (x <= 1.0)
+        is_inside = np.where(box.periodic, np.isfinite(x), is_between).all(axis=1)
         x = x[is_inside] - grid.start
         u = u[is_inside]
     base, weights = _spline_weights(x, grid)
@@ -362,10 +362,10 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
 
     # Two sums are one of complex numbers, which takes less time than two of real ones.
     # In two dimensions the weight is left over.
-    rows: list[Floats | None] = [None, *np.ascontiguousarray(u.T)]
+    components = list(np.ascontiguousarray(u.T))
     lone_sum = np.zeros(padded_size) if grid.dimension == 2 else None
-    paired = rows[grid.dimension == 2 :]
-    pair_sums = [np.zeros(padded_size, np.complex128) for _ in paired[::2]]
+    pair_count = (grid.dimension + 1) // 2
+    pair_sums = [np.zeros(padded_size, np.complex128) for _ in range(pair_count)]
     weight = np.empty(len(x))
     product = np.empty(len(x), np.complex128)
     for offsets in itertools.product(range(3), repeat=grid.dimension):
@@ -376,12 +376,12 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
         if lone_sum is not None:
             np.add.at(lone_sum[shift:], corner, weight)
         for number, pair_sum in enumerate(pair_sums):
-            first = paired[2 * number]
-            if first is None:
+            second = 2 * number + (lone_sum is not None)
+            if second == 0:
                 product.real = weight
             else:
-                np.multiply(weight, first, out=product.real)
-            np.multiply(weight, paired[2 * number + 1], out=product.imag)
+                np.multiply(weight, components[second - 1], out=product.real)
+            np.multiply(weight, components[second], out=product.imag)
             np.add.at(pair_sum[shift:], corner, product)
 
     sums = [] if lone_sum is None else [lone_sum]

@@ -287,31 +287,6 @@ def scenario_path(root: Path, key: ScenarioKey) -> Path:
     return folder / key.subset / f"{key.scenario:04d}.nc"
 
 
-def generation_command(path: Path) -> str | None:
-    """Return the command that makes a scenario file anew.
-
-    None where the path is not that of a data set.
-
-    >>> generation_command(Path("/my data/cavity/tiny/v2/test/0003.nc"))
-    "lagbench generate --split cavity --size tiny --subset test --root '/my data'"
-    >>> generation_command(Path("/d/drawn-0a/cavity/tiny/v2/test/1000.nc"))
-    'lagbench generate --draw-seed 0a --split cavity --size tiny --root /d'
-    """
-    folders = path.parts[:-1]
-    if len(folders) < 4 or re.fullmatch(r"v\d+", folders[-2]) is None:
-        return None
-    split, size, _, subset = folders[-4:]
-    data_root = path.parents[4]
-    if data_root.name.startswith(DRAWN_PREFIX):
-        draw_seed = shlex.quote(data_root.name.removeprefix(DRAWN_PREFIX))
-        root = quote_root(data_root.parent)
-        names = f"--draw-seed {draw_seed} --split {split} --size {size}"
-        return f"lagbench generate {names} --root {root}"
-    root = quote_root(data_root)
-    names = f"--split {split} --size {size} --subset {subset}"
-    return f"lagbench generate {names} --root {root}"
-
-
 def quote_root(root: str | Path) -> str:
     """Return a root as an option's value for a shell: its URL, or its absolute path."""
     url = as_url(root) or url_of(Path(root))

@@ -30,7 +30,7 @@ from .hdf5 import (
     read_attribute,
     to_plain,
 )
-from .layout import ScenarioKey, generation_command
+from .layout import ScenarioKey
 from .variables import ATTRIBUTES, MAX_VALUES_PER_FRAME, require_known_material
 
 BLOCK_BYTES = 1 << 20
@@ -38,6 +38,11 @@ BLOCK_BYTES = 1 << 20
 
 CHUNK_CACHE = 1 << 20
 """Chunk cache of a variable [bytes]; netCDF's 64 MB would keep whole scenarios."""
+
+REPAIR = (
+    "lagbench generate writes it anew; a local split is made again by lagbench import"
+)
+"""What to do about a file that is missing or damaged."""
 
 MOST_LETTERS = 80
 """Letters of a wrong attribute in a message."""
@@ -226,9 +231,7 @@ class ScenarioFile:
         if "material" not in self._variables:
             return
         for block in self.blocks("material"):
-            require_known_material(
-                block, where=str(self.path), fix=_repair_hint(self.path)
-            )
+            require_known_material(block, where=str(self.path), fix=REPAIR)
 
     def stored_hashes(self) -> dict[str, object]:
         """Return the hash of each variable as the file states it."""
@@ -259,7 +262,7 @@ def read_scenario(path: Path) -> ScenarioFile:
         DataError: the file is missing, damaged, or no scenario, or it may not be read.
     """
     if not path.is_file():
-        raise _missing_error(path, _repair_hint(path))
+        raise DataError(f"a scenario file is missing; {REPAIR}", where=str(path))
     with _damage_errors(path), ExitStack() as stack:
         file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
         stack.callback(file.close)
@@ -289,46 +292,27 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
     """
     with read_scenario(path) as file:
         stored_hashes = file.stored_hashes()
-        stored_content_hash = file.header.content_sha256
         hasher = file.computed_hasher()
-        for name, variable_hash in hasher.digests().items():
-            if stored_hashes.get(name) != variable_hash:
-                raise _hash_error(
-                    "values differ from their hash",
-                    where=f"{path}, variable {name!r}",
-                    expected=stored_hashes.get(name),
-                    got=variable_hash,
-                    path=path,
-                )
         content_hash = hasher.hexdigest()
-        if content_hash != stored_content_hash:
-            raise _hash_error(
-                "attributes differ from their hash",
-                where=f"{path}, attributes",
-                expected=stored_content_hash,
-                got=content_hash,
-                path=path,
-            )
-        if expected is not None and not content_hash.startswith(expected):
-            raise _hash_error(
-                "the file has another content hash",
-                where=str(path),
-                expected=expected,
-                got=content_hash,
-                path=path,
-            )
+        comparisons: list[tuple[str, str, object, str]] = []
+        for name, variable_hash in hasher.digests().items():
+            where = f"{path}, variable {name!r}"
+            stored = stored_hashes.get(name)
+            comparisons.append(("values", where, stored, variable_hash))
+        stored = file.header.content_sha256
+        comparisons.append(("attributes", f"{path}, attributes", stored, content_hash))
+        if expected is not None:
+            digits = content_hash[: len(expected)]
+            comparisons.append(("values or attributes", str(path), expected, digits))
+        for what, where, known_hash, computed_hash in comparisons:
+            if known_hash != computed_hash:
+                raise DataError(
+                    f"{what} differ from their hash: got {computed_hash}, expected "
+                    f"{str(known_hash or 'a stored hash')[:MOST_LETTERS]}; {REPAIR}",
+                    where=where,
+                )
         file.check_material()
     return content_hash
-
-
-def _hash_error(
-    what: str, *, where: str, expected: object, got: str, path: Path
-) -> DataError:
-    return DataError(
-        f"{what}: got {got}, expected "
-        f"{str(expected or 'a stored hash')[:MOST_LETTERS]}; {_repair_hint(path)}",
-        where=where,
-    )
 
 
 def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
@@ -407,7 +391,7 @@ def reading_error(
     error: Exception,
     variable: str | None = None,
     *,
-    fix: str | None = None,
+    fix: str = REPAIR,
 ) -> LagbenchError:
     """Return our error for one that a library raised on reading a scenario file.
 
@@ -425,35 +409,17 @@ def reading_error(
 
 
 def damage_error(
-    path: Path, got: str, variable: str | None = None, *, fix: str | None = None
+    path: Path, got: str, variable: str | None = None, *, fix: str = REPAIR
 ) -> DataError:
     """Return the error that a file, or one of its variables, is damaged.
 
-    A file that vanished while it was read, or may not be read, is not called damaged.
+    A file that vanished while it was read is not called damaged.
     """
-    if not os.path.exists(path):
-        return _missing_error(path, fix or _repair_hint(path))
+    if not path.exists():
+        return DataError(f"a scenario file is missing; {fix}", where=str(path))
     where = str(path)
     if variable is not None:
         where = f"{path}, variable {variable!r}"
-    if not os.access(path, os.R_OK):
-        return DataError(
-            "a scenario file may not be read: permission denied; see who owns it: ls "
-            "-l; chmod +r lets others read it",
-            where=where,
-        )
     return DataError(
-        f"a scenario file is damaged or not one of lagbench: {got}; "
-        f"{fix or _repair_hint(path)}",
-        where=where,
+        f"a scenario file is damaged or not one of lagbench: {got}; {fix}", where=where
     )
-
-
-def _missing_error(path: Path, fix: str) -> DataError:
-    return DataError(f"a scenario file is missing; {fix}", where=str(path))
-
-
-def _repair_hint(path: Path) -> str:
-    command = generation_command(path) or "lagbench generate"
-    advice = "a local split is made again by lagbench import"
-    return f"{command} writes it anew; {advice}"

@@ -70,7 +70,7 @@ def list_trajectories(path: Path) -> list[tuple[str, Callable[[], xr.Dataset]]]:
     """Return name and opener of each trajectory of a file, in its order."""
     with zipfile.ZipFile(path) as archive:
         keys = [name.removesuffix(".npy") for name in archive.namelist()]
-    trajectories = []
+    trajectories: list[tuple[str, Callable[[], xr.Dataset]]] = []
     for key in keys:
         if key != JOINT:
             trajectories.append((key, partial(_read, path, key)))

@@ -242,7 +242,7 @@ def _name_dimensions(dataset: xr.Dataset, name: str) -> xr.Dataset:
     """Return a dataset whose positions have the dimensions time, particle, space."""
     for vector, patterns in COMPONENTS.items():
         for pattern in patterns:
-            components = []
+            components: list[str] = []
             for axes in ("xyz", "012"):
                 words = [pattern.format(axis) for axis in axes]
                 components += filter(None, [_find(dataset, [word]) for word in words])
@@ -258,9 +258,9 @@ def _name_dimensions(dataset: xr.Dataset, name: str) -> xr.Dataset:
         )
     changed = {}
     missing = []
-    for wanted, words in DIMENSIONS.items():
+    for wanted, known in DIMENSIONS.items():
         dims = {str(dim).lower(): str(dim) for dim in dataset[found].dims}
-        matches = [dims[word] for word in words if word in dims]
+        matches = [dims[word] for word in known if word in dims]
         if not matches:
             missing.append(wanted)
         elif matches[0] != wanted:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import netCDF4
 import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
@@ -140,18 +139,6 @@ def rewritten(path: Path) -> None:
         file["velocity"][7, 11, 0] += np.float32(1e-6)
 
 
-def described(**attributes: object) -> Callable[[Path], None]:
-    """Return what changes how readers understand positions, though no stored value
-    changes.
-    """
-
-    def change(path: Path) -> None:
-        with netCDF4.Dataset(path, "r+") as file:
-            file["position"].setncatts(attributes)
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
@@ -163,8 +150,6 @@ def described(**attributes: object) -> Callable[[Path], None]:
             "damaged",
         ),
         (rewritten, "variable 'velocity'"),
-        (described(scale_factor=2.0), "(?s)variable 'position'.*scale_factor"),
-        (described(units="m"), "(?s)variable 'position'.*units"),
         (
             lambda path: shutil.copy(path.with_name("0004.nc"), path),
             "another scenario",
