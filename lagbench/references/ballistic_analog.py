@@ -202,71 +202,47 @@ def fly_then_follow(
         most_together: particles of a material that are assigned together, at most.
     """
     horizon = len(given.predicted_frames)
-    flown = min(horizon, frames_of_flight(given) + choice.lag)
+    flown = horizon
+    if library is not None:
+        flown = min(horizon, frames_of_flight(given) + choice.lag)
     for frames_on in range(1, flown + 1):
         yield ballistic_positions(given, frames_on)
-    if flown == horizon:
+    if library is None or flown == horizon:
         return
-    analogs = _analogs_of(
-        given,
-        flown,
-        choice,
-        library=library,
-        divide=divide,
-        most_together=most_together,
-    )
-    for frames_on in range(1, horizon - flown + 1):
-        if not analogs:
-            yield ballistic_positions(given, flown + frames_on)
-            continue
-        yield given.inside(combine(given, analogs, frames_on))
 
-
-def _analogs_of(
-    given: Given,
-    flown: int,
-    choice: Choice,
-    *,
-    library: StateLibrary | None,
-    divide: Division,
-    most_together: int,
-) -> list[FollowedAnalog]:
-    """Return the analogs of the state after so many frames of flight."""
-    if library is None:
-        return []
-    position = ballistic_positions(given, flown) if flown else given.last
+    position = given.last
     previous = given.position[-2]
     if flown == 1:
         previous = given.last
     elif flown > 1:
         previous = ballistic_positions(given, flown - 1)
+    if flown > 0:
+        position = ballistic_positions(given, flown)
     velocity = given.box.displacement(previous, position)  # [length/frame]
     feature = describe_state(position, velocity, given.material)
     states = library.nearest(feature, count=choice.analogs)
-    if not states:
-        return []
     distances = np.linalg.norm(library.features[states] - feature, axis=1)
-    followed = []
     followers = divide(distances, len(position))
+    analogs = []
     for state, distance, members in zip(states, distances, followers, strict=True):
         scenario = int(library.scenarios[state])
         frame = int(library.frames[state])
         motion = read_train_scenario(given.size.path(given.root, scenario))
         mirror = mirrors_of(given.size)[library.mirrors[state]]
-        start = mirror.positions(motion.position[frame])
         partner = assign_particles(
             position[members],
-            start,
+            mirror.positions(motion.position[frame]),
             given.material[members],
             motion.material,
             given.box,
             most_together=most_together,
         )
-        stop = frame + 1 + len(given.predicted_frames)
+        stop = frame + 1 + horizon
         paths = mirror.positions(motion.position[frame:stop, partner])
         offset = given.box.displacement(paths[0], position[members])
-        followed.append(FollowedAnalog(float(distance), members, paths, offset))
-    return followed
+        analogs.append(FollowedAnalog(float(distance), members, paths, offset))
+    for frames_on in range(1, horizon - flown + 1):
+        yield given.inside(combine(given, analogs, frames_on))
 
 
 def predict(given: Given) -> Prediction:

@@ -140,6 +140,7 @@ def test_windows_state_the_disc_and_no_particle_enters_it(
         assert entry.facts["jacobian_max"] < 1.15
 
 
+@pytest.mark.slow
 def test_a_sheet_of_a_channel_is_low(
     tiny_split: Callable[..., GenerationResult], tmp_path: Path
 ) -> None:

@@ -54,14 +54,6 @@ def test_drivers_give_the_same_bits(threads: int) -> None:
         np.testing.assert_equal(own, after(constants, [state], 450))
 
 
-def test_frames_do_not_matter() -> None:
-    """450 substeps in one call and in calls of 50 give the same bits."""
-    states = [scenario(NO_SLIP, seed=6, speed=0.4, walls=ALL_LIDS)]
-    np.testing.assert_equal(
-        after(NO_SLIP, states, *[50] * 9), after(NO_SLIP, states, 450)
-    )
-
-
 def test_what_the_runtime_cannot_do_is_refused() -> None:
     """The serial driver takes one scenario; the first solver of a process fixes the
     pool of threads.
@@ -107,7 +99,9 @@ def test_the_engine_is_imported_late_and_quietly() -> None:
     assert result.stdout == ""
 
 
-@pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
+@pytest.mark.parametrize(
+    "device", [Device.CPU, pytest.param(Device.PARALLEL, marks=pytest.mark.slow)]
+)
 def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
     """Two programs, one shorter than the run, in calls that end within frames, act
     frame by frame.

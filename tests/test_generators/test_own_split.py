@@ -152,14 +152,3 @@ def test_a_split_without_recorded_hashes_says_how_to_record_them(
         assert f"--split {generated.split} --size {generated.size} " in line
         assert f"--root {generated.root}" in line
         assert f"--registry {unmeasured_path}" in line
-
-
-def test_a_split_with_recorded_hashes_says_nothing_of_recording(
-    generated: GenerationResult,
-    run: Callable[..., Result],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("LAGBENCH_REGISTRY", raising=False)
-    result = run("verify", generated.split, "--root", generated.root)
-    assert result.exit_code == 0, result.stderr
-    assert "generators.record" not in result.stdout

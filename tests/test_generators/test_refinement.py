@@ -60,6 +60,7 @@ def test_walls_and_rates_stay(split: str) -> None:
         assert fine.wall / fine.grid == coarse.wall / coarse.grid
 
 
+@pytest.mark.slow
 def test_a_finer_solver_takes_the_finer_state() -> None:
     size = refined(tiny("cavity"), 2)
     solver = build(solver_constants(size), threads=1)

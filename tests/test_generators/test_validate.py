@@ -256,6 +256,7 @@ def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
     assert check_substeps == [300]
 
 
+@pytest.mark.slow
 def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> None:
     """The energy falls once the lid stops; at Re 250 there is no table, so errors are
     null.
