@@ -171,10 +171,7 @@ def name_trajectory(
             f"{name} has {position.sizes['time']} frames of "
             f"{position.sizes['particle']} particles; a trajectory has two or more"
         )
-    dtype = np.result_type(position.dtype, np.float32)
-    if position.dtype != dtype:  # reads all frames
-        position = position.astype(dtype)
-    arrays = {"position": position}
+    arrays = {"position": position.astype(np.result_type(position.dtype, np.float32))}
     dims = ("time", "particle", "space")
     notes = _note_units(position, name)
     if "velocity" in variables:

@@ -256,8 +256,7 @@ def _read_numpy(path: Path, options: Reading) -> list[Source]:
 def _read_netcdf(path: Path, options: Reading) -> list[Source]:
     def open_dataset() -> xr.Dataset:
         engine = "zarr" if path.suffix == ".zarr" else None
-        # times stay numbers with units, which say how many seconds they are
-        dataset = xr.open_dataset(path, engine=engine, decode_times=False)
+        dataset = _open_in_chunks(path, engine=engine)
         if options.positions is not None:
             dataset = dataset.rename({options.positions: "position"})
         if options.axes and "position" in dataset:
@@ -267,6 +266,16 @@ def _read_netcdf(path: Path, options: Reading) -> list[Source]:
         return dataset
 
     return _split_trajectories(path, open_dataset)
+
+
+def _open_in_chunks(path: Path, **options: Any) -> xr.Dataset:  # noqa: ANN401
+    """Open a file whose numbers are read when needed, in chunks of some 100 MB."""
+    # times stay numbers with units, which say how many seconds they are
+    dataset = xr.open_dataset(path, decode_times=False, **options)
+    for name, variable in dataset.data_vars.items():
+        if variable.dtype.kind in "iuf":
+            dataset[name] = variable.chunk("auto")
+    return dataset
 
 
 def _read_hdf5(path: Path, options: Reading) -> list[Source]:
@@ -297,9 +306,7 @@ def _read_hdf5(path: Path, options: Reading) -> list[Source]:
 
 def _open_group(path: Path, group: str, name: str, axes: Sequence[str]) -> xr.Dataset:
     """Return the numbers in a group, which are read when they are needed."""
-    file = xr.open_dataset(
-        path, engine="h5netcdf", group=group, phony_dims="sort", decode_times=False
-    )
+    file = _open_in_chunks(path, engine="h5netcdf", group=group, phony_dims="sort")
     arrays = {}
     for key, variable in file.variables.items():
         if variable.dtype.kind in "iuf":
