@@ -44,12 +44,24 @@ def find(name: str) -> CatalogueEntry:
     """Return a baseline by name.
 
     Raises:
-        UsageError: there is no such baseline.
+        UsageError: there is no such baseline, or its entry point names none.
     """
     points = _find_points()
     if name not in points:
         raise UsageError(f"no baseline {name!r}; {suggest_name(name, points)}")
-    return _load_entry(points[name])
+    point = points[name]
+    model = point.load()
+    if inspect.isclass(model) and issubclass(model, Baseline):
+        recipes = _find_recipes(model, name)
+        return CatalogueEntry(name=name, model=model, recipes=recipes)
+    if inspect.isclass(model) and issubclass(model, Operator):
+        network = GraphNetwork.with_operator(model)
+        recipes = _find_recipes(model, OPERATOR_RECIPES)
+        return CatalogueEntry(name=name, model=network, recipes=recipes)
+    raise UsageError(
+        f"the entry point {name} names {point.value}, which is no subclass of Baseline "
+        "or Operator: docs/extending.md"
+    )
 
 
 def _find_points() -> dict[str, EntryPoint]:
@@ -61,21 +73,6 @@ def _find_points() -> dict[str, EntryPoint]:
     for point in own_first:
         points.setdefault(point.name, point)
     return points
-
-
-def _load_entry(point: EntryPoint) -> CatalogueEntry:
-    loaded_class = point.load()
-    if inspect.isclass(loaded_class) and issubclass(loaded_class, Baseline):
-        recipes = _find_recipes(loaded_class, point.name)
-        return CatalogueEntry(name=point.name, model=loaded_class, recipes=recipes)
-    if inspect.isclass(loaded_class) and issubclass(loaded_class, Operator):
-        model = GraphNetwork.with_operator(loaded_class)
-        recipes = _find_recipes(loaded_class, OPERATOR_RECIPES)
-        return CatalogueEntry(name=point.name, model=model, recipes=recipes)
-    raise UsageError(
-        f"the entry point {point.name} names {point.value}, which is no subclass of "
-        "Baseline or Operator: docs/extending.md"
-    )
 
 
 def _find_recipes(model: type, name: str) -> Path | None:

@@ -9,6 +9,7 @@ prediction turns with the particles alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from .baseline import DatasetInfo
 from .deviations import root_mean_square
 from .graph import EMBEDDING, Standardisation, edge_features, wall_distance
+from .network import LayeredNetwork
 from .operators.gns import GNS
 from .operators.operator import Losses, Operator, sum_edges
 from .simulator import GraphNetwork, GraphNetworkOptions, ParticleState
@@ -36,7 +38,7 @@ class Particles(NamedTuple):
 
 
 class EquivariantNetwork(GraphNetwork):
-    """A graph network of scalars and vectors; a model adds ``_make_network``.
+    """A graph network of scalars and vectors; a model names its layers.
 
     The vectors of a particle are its last velocity, the changes that led to it, the
     sum of ``(1 - distance) n`` of near walls with their normals n, the velocities of
@@ -46,10 +48,20 @@ class EquivariantNetwork(GraphNetwork):
 
     operator: ClassVar[type[Operator]] = GNS
     recipes = "recipes/particle-networks.yaml"
+    layers: ClassVar[Callable[..., LayeredNetwork]]
 
     def __init__(self, options: GraphNetworkOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         self.gravity = nn.Parameter(torch.zeros(info.box.dimension))
+
+    def _make_network(self) -> LayeredNetwork:
+        """Return the network; untrained, it returns zeros."""
+        return self.layers(
+            scalars=self.scalars,
+            vectors=self.vectors,
+            latent=self.options.latent,
+            layers=self.options.layers,
+        )
 
     @property
     def vectors(self) -> int:

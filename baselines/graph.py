@@ -241,7 +241,7 @@ class NodeFeatures(nn.Module):
                 shape [particle, wall, axis]; None stands for walls at rest.
         """
         last_velocity = self.velocity(velocity[:, -1])
-        acceleration = velocity.diff(dim=1)
+        acceleration = velocity[:, 1:] - velocity[:, :-1]
         changes = self.acceleration(acceleration)
         distance = wall_distance(position, self.bounds, self.reach, self.periodic)
         embedded = self.embedding(material)

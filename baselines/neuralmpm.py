@@ -130,8 +130,12 @@ class NeuralMPM(Baseline):
         state = self.start(given, average=False)
         next_frame = self.history  # the first frame whose error counts
         if generator is not None and self.options.pushforward:
-            state, frame_count = self._push_forward(state, generator)
-            next_frame += frame_count
+            end = self.options.pushforward + 1
+            drawn = torch.randint(end, (), generator=generator, device=generator.device)
+            with torch.no_grad():
+                for _ in range(int(drawn)):
+                    state, _ = self.call(state, average=False)
+                    next_frame += self.options.bundle
 
         errors: list[Tensor] = []
         reached = state.position
@@ -153,21 +157,6 @@ class NeuralMPM(Baseline):
                 next_frame += 1
         frame_errors = torch.stack(errors)
         return {"velocity": frame_errors.mean()}
-
-    @torch.no_grad()
-    def _push_forward(
-        self, state: GridState, generator: torch.Generator
-    ) -> tuple[GridState, int]:
-        """Return the state after a random number of calls, and the number of frames."""
-        device = generator.device
-        end = self.options.pushforward + 1
-        drawn = torch.randint(end, (), generator=generator, device=device)
-        call_count = int(drawn)
-        frame_count = 0
-        for _ in range(call_count):
-            state, frames = self.call(state, average=False)
-            frame_count += len(frames)
-        return state, frame_count
 
     def start(self, given: Batch, *, average: bool = True) -> GridState:
         """Return the state after the given frames.

@@ -106,7 +106,7 @@ class Optimisation:
         return total
 
     def make_step(self, loss: Tensor) -> None:
-        """Make a step down the gradient of a loss.
+        """Make a step down the gradient of a loss; move the mean towards the weights.
 
         Raises:
             WorkFailedError: the gradient is not finite; the weights stay as they are.
@@ -127,15 +127,10 @@ class Optimisation:
             group["lr"] = self.learning_rate
         self.optimizer.step()
         self.step += 1
-        if self.options.ema > 0.0:
-            self._update_mean()
-
-    def _update_mean(self) -> None:
-        """Move the running mean towards the weights.
-
-        It is in the optimiser's state, which checkpoints hold. At first it moves
-        faster, so that it soon forgets the weights of the start.
-        """
+        if self.options.ema == 0.0:
+            return
+        # The running mean is in the optimiser's state, which checkpoints hold. At first
+        # it moves faster, so that it soon forgets the weights of the start.
         early_share = self.step / (self.step + 9.0)
         share = min(self.options.ema, early_share)
         for parameter, state in self.optimizer.state.items():

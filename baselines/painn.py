@@ -124,12 +124,4 @@ class PaiNN(EquivariantNetwork):
     """
 
     method = "PaiNN"
-
-    def _make_network(self) -> LayeredNetwork:
-        """Return the network; untrained, it returns zeros."""
-        return PaiNNLayers(
-            scalars=self.scalars,
-            vectors=self.vectors,
-            latent=self.options.latent,
-            layers=self.options.layers,
-        )
+    layers = PaiNNLayers

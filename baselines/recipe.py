@@ -22,7 +22,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import yaml
@@ -274,7 +273,10 @@ def recipe_for(
         variant = None
     file = _RecipeFile(format=1)
     if path:
-        file = _read_file(path)
+        try:
+            file = _RecipeFile.model_validate(read_yaml(path))
+        except ValidationError as error:
+            raise UnreadableFileError(_describe(error), where=str(path)) from None
 
     size_name = size
     if variant:
@@ -338,13 +340,6 @@ def change_options(
             f"{', '.join(changed)} cannot change after the training", where="--set"
         )
     return after
-
-
-def _read_file(path: Path) -> _RecipeFile:
-    try:
-        return _RecipeFile.model_validate(read_yaml(path))
-    except ValidationError as error:
-        raise UnreadableFileError(_describe(error), where=str(path)) from None
 
 
 def _merge(below: Layer, above: Layer) -> Layer:

@@ -161,12 +161,4 @@ class SEGNN(EquivariantNetwork):
     """
 
     method = "SEGNN"
-
-    def _make_network(self) -> LayeredNetwork:
-        """Return the network; untrained, it returns zeros."""
-        return SEGNNLayers(
-            scalars=self.scalars,
-            vectors=self.vectors,
-            latent=self.options.latent,
-            layers=self.options.layers,
-        )
+    layers = SEGNNLayers

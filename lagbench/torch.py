@@ -368,25 +368,6 @@ def check_history(history: int | None, given_frames: int, *, where: str) -> int:
     return history
 
 
-def _check_device(device: torch.device | str | int) -> torch.device:
-    """Return a device on which tensors can be made here and read again.
-
-    Raises:
-        UsageError: torch has no such device here.
-    """
-    try:
-        tensor = torch.zeros(1, device=device)
-        tensor.cpu()
-    except (RuntimeError, AssertionError, TypeError, ValueError) as error:
-        reason = str(error).split("\n")[0][:200]
-        raise UsageError(
-            f"torch has no such device here: {str(device)[:80]!r}: {reason}; leave "
-            "device out: the model then runs on the processor",
-            where="predict, device",
-        ) from error
-    return tensor.device
-
-
 def predict(
     step: Step,
     split: str | Path,
@@ -420,9 +401,8 @@ def predict(
         [frame, particle, axis].
 
     Raises:
-        UsageError: unknown split, size, subset or device, history beyond the given
-            frames, a scenario with fewer frames than the task, or a model that returns
-            positions that are not finite.
+        UsageError: unknown split, size or subset, history beyond the given frames, or a
+            scenario with fewer frames than the task.
         DataError: scenarios are missing; the message has the command that makes them.
     """
     data = WindowDataset(
@@ -430,7 +410,6 @@ def predict(
     )
     task = data.size.task
     history = check_history(history, task.input_frames, where="predict")
-    device = _check_device(device)
     visible_frames = slice(task.input_frames - history, None)
     needed_frames = task.input_frames + task.horizon
     for scenario, first in zip(data.scenarios, data.starts, strict=False):
@@ -457,23 +436,4 @@ def predict(
             positions = roll_out(step, given, task.horizon)
         # from [particle, frame, axis] to [frame, particle, axis]
         by_frame = positions.transpose(0, 1).float().cpu().numpy()
-        _check_finite(by_frame, scenario, first_frame=task.input_frames)
         yield scenario, by_frame
-
-
-def _check_finite(
-    positions: NDArray[np.float32], scenario: int, *, first_frame: int
-) -> None:
-    """Refuse a rollout with positions that no file of predictions may hold."""
-    bad_places = np.argwhere(~np.isfinite(positions))
-    if not len(bad_places):
-        return
-    step, particle, axis = bad_places[0].tolist()
-    raise UsageError(
-        "the model returned positions that are not finite: "
-        f"{positions[step, particle, axis]}; set the network to eval() and check its "
-        "input scaling; a rollout that diverges is frozen at its last finite frame "
-        "and stored with PredictionsWriter.add(..., diverged_at=FRAME)",
-        where=f"predict, scenario {scenario}, frame {first_frame + step}, "
-        f"particle {particle}",
-    )

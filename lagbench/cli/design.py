@@ -72,20 +72,18 @@ def judge_command(
             entry, workers=worker_count(workers), results=results, progress=progress
         )
     lines: list[dict[str, Any]] = []
+    rows = []
     for name, verdict in verdicts.items():
         score = scale_error(name, verdict.error)
         lines.append({"task": name, "score": score, **verdict.model_dump()})
+        error = "failed" if verdict.error is None else f"{verdict.error:.4g}"
+        score_text = "–" if score is None else f"{score:.3f}"
+        rows.append((name, error, score_text, verdict.sha256[:16]))
     scores = [line["score"] for line in lines if line["score"] is not None]
     mean_score = mean(scores) if scores else None
     if as_json:
         print_json({"mean_score": mean_score, "verdicts": lines})
         return
-    rows = []
-    for name, verdict in verdicts.items():
-        error = "failed" if verdict.error is None else f"{verdict.error:.4g}"
-        score = scale_error(name, verdict.error)
-        score_text = "–" if score is None else f"{score:.3f}"
-        rows.append((name, error, score_text, verdict.sha256[:16]))
     print_table("Verdicts", ("task", "error", "score", "sha256"), rows)
     if mean_score is not None and not quiet:
         print_line(f"mean score of {len(scores)} tasks: {mean_score:.3f}")

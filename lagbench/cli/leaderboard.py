@@ -14,7 +14,7 @@ from cyclopts.types import PositiveInt
 
 from lagbench.atomic import check_output_file
 from lagbench.board.blind import score_blind
-from lagbench.board.check import CheckResult, check_board
+from lagbench.board.check import check_board
 from lagbench.board.collect import collect, list_data_sets
 from lagbench.board.folder import Folder
 from lagbench.board.models import choose_data_sets
@@ -118,19 +118,18 @@ def check_command(
     if not as_json:
         for issue in result.findings:
             print_on_stderr(issue)
-    print_result(result, _describe_check(result), as_json=as_json, quiet=quiet)
-    return result.exit_code
-
-
-def _describe_check(result: CheckResult) -> Iterator[str]:
+    lines = []
     for one in result.confirmed:
-        yield f"{one.predictions}: confirms {one.score_file} of {one.entry}"
+        lines.append(f"{one.predictions}: confirms {one.score_file} of {one.entry}")
     for entry in result.recorded:
-        yield f"recorded as verified: {entry}"
+        lines.append(f"recorded as verified: {entry}")
     state = "nothing wrong"
     if result.findings:
         state = format_count(len(result.findings), "finding")
-    yield f"{result.folder}: {format_count(result.entries, 'entry')}, {state}"
+    entries = format_count(result.entries, "entry")
+    lines.append(f"{result.folder}: {entries}, {state}")
+    print_result(result, lines, as_json=as_json, quiet=quiet)
+    return result.exit_code
 
 
 def picture_command(

@@ -27,6 +27,7 @@ from lagbench.make.generate import GenerationResult
 from lagbench.models.export import export_onnx
 from lagbench.models.onnx_model import OnnxModel, check_onnx, find_edges
 from lagbench.models.predict_onnx import predict_onnx
+from lagbench.models.registered import build_registered
 from lagbench.tensors import Batch
 from lagbench.torch import predict
 
@@ -79,40 +80,6 @@ def test_edges_are_all_pairs_within_the_radius() -> None:
         receivers, senders = np.nonzero(distance <= 0.2)
         edges = find_edges(position, 0.2, bounds, np.array(periodic))
         assert_array_equal(edges, [senders, receivers])
-
-
-def test_an_exported_step_predicts_what_it_did(
-    tmp_path: Path, generated: GenerationResult
-) -> None:
-    """Sums over particles of one index, walls and weights survive the export."""
-    net = torch.nn.Linear(2, 2)
-
-    def step(window: Batch) -> torch.Tensor:
-        before, now = window.position.unbind(1)
-        velocity = now - before
-        cell = (4 * now[:, 0]).long().clamp(0, 3)
-        ones = torch.ones_like(velocity)
-        sums = torch.zeros(4, 2).index_add(0, cell, velocity)
-        counts = torch.zeros(4, 2).index_add(0, cell, ones)
-        mean = sums / counts.clamp(min=1.0)
-        correction: torch.Tensor = net(velocity)
-        motion = 0.5 * velocity + 0.1 * mean[cell] + 1e-4 * correction
-        return now + motion
-
-    path = export_onnx(
-        step,
-        tmp_path / "model.onnx",
-        split=SIZE.split,
-        size=SIZE.name,
-        modules=[net],
-        history=2,
-        root=generated.root,
-    )
-    model = OnnxModel(path, size=SIZE, root=generated.root)
-    assert model.parameters >= 6
-    scenario, expected = first_prediction(step, generated.root)
-    position = model.predict(SIZE.path(generated.root, scenario))
-    assert_allclose(position, expected, rtol=0, atol=1e-5)
 
 
 def test_an_exported_step_sees_the_viscosity(
@@ -172,6 +139,33 @@ def test_a_step_over_a_grid_of_particles_is_exported(
     model = OnnxModel(path, size=SIZE, root=generated.root)
     scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
+    assert_allclose(position, expected, rtol=0, atol=1e-5)
+
+
+def test_a_baseline_without_a_graph_is_exported(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """UPT; networks of neighbours go to the board as safetensors."""
+    options = {"latent": 8, "layers": 1, "velocities": 2}
+    data_set: Any = {"split": SIZE.split, "size": SIZE.name, "root": generated.root}
+    torch.manual_seed(0)
+    model = build_registered("upt", options=options, **data_set).eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+
+    def step(window: Batch) -> torch.Tensor:
+        _, position = model.advance(model.start(window))
+        return position
+
+    path = export_onnx(
+        step, tmp_path / "upt.onnx", modules=[model], history=3, **data_set
+    )
+    scenario = SIZE.subsets["test"][0]
+    _, expected = next(
+        predict(step, SIZE.split, size=SIZE.name, history=3, root=generated.root)
+    )
+    exported = OnnxModel(path, size=SIZE, root=generated.root)
+    position = exported.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)
 
 
