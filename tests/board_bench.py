@@ -122,20 +122,6 @@ def make_report_bench(home: Path, split: str) -> ReportBench:
     return ReportBench(folder / "root", registry, size)
 
 
-def page_of(home: Path, split: str) -> Path:
-    """Return the report on two methods of a split, one of a hostile name.
-
-    It is made once for all processes that share a folder.
-    """
-    page = home / f"page-{split}" / "report" / "index.html"
-    with FileLock(home / f"page-{split}.lock"):
-        if not page.exists():
-            bench = make_report_bench(home, split)
-            path = bench.report(page.parents[1], METHODS)
-            assert path == page
-    return page
-
-
 def motion(size: Size, scenario: int) -> Floats:
     """Return true positions, shape [frame, particle, 2].
 

@@ -69,30 +69,6 @@ def scheduler_process() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
         process.kill()
 
 
-@contextmanager
-def lonely_scheduler(workers: int) -> Iterator[tuple[str, list[Any]]]:
-    """Run a scheduler here whose workers nobody starts again; yield its address and
-    their processes.
-    """
-    import distributed
-
-    there = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}
-    options: dict[str, Any] = {"n_workers": 0, "dashboard_address": ":0"}
-    with distributed.LocalCluster(**options, silence_logs=50) as running:
-        command = [sys.executable, "-m", "distributed.cli.dask_worker"]
-        command += [running.scheduler_address, "--no-nanny", "--nthreads", "1"]
-        command += ["--no-dashboard", "--death-timeout", "60"]
-        processes = []
-        for _ in range(workers):
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            processes.append(subprocess.Popen(command, env=there, **quiet))
-        running.wait_for_workers(workers)
-        yield running.scheduler_address, processes
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
 def everything(folder: Path) -> dict[str, bytes]:
     """Return path and bytes of every file of a data set but its lock and notes of this
     machine.

@@ -349,15 +349,6 @@ def greatest_difference(first: Tensor, second: Tensor) -> float:
     return float(difference.abs().max())
 
 
-def read_folder(folder: Path) -> dict[str, bytes]:
-    """Return the content of all files below a folder."""
-    contents = {}
-    for path in folder.rglob("*"):
-        if path.is_file():
-            contents[str(path.relative_to(folder))] = path.read_bytes()
-    return contents
-
-
 def read_training_log(folder: Path) -> dict[str, Any]:
     """Return what a training wrote beside its weights."""
     content = (folder / "training.json").read_text()

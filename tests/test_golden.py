@@ -18,12 +18,13 @@ RECORDED = json.loads(golden.GOLDEN_FILE.read_text())
 @pytest.fixture(scope="module")
 def root(
     tmp_path_factory: pytest.TempPathFactory,
+    generated: GenerationResult,
     tiny_split: Callable[..., GenerationResult],
 ) -> Path:
     """A folder with the tiny data of the quick splits."""
     folder = tmp_path_factory.mktemp("golden")
-    for split in golden.QUICK_SPLITS:
-        (folder / split).symlink_to(tiny_split(split).root / split)
+    for result in (generated, tiny_split("fluid")):
+        (folder / result.split).symlink_to(result.root / result.split)
     return folder
 
 

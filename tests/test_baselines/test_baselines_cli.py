@@ -11,7 +11,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import netCDF4
 import pytest
 from command_line import CliRunner, Result
 from onnx_files import straight_on
@@ -79,58 +78,6 @@ def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) ->
     assert predicted.exit_code == 0, predicted.output
     assert json.loads(predicted.stdout)["seconds_per_frame"] > 0
     assert validate("predictions.nc").valid
-
-
-@pytest.mark.slow
-def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
-    """Without --json each command says what it did and which one comes next, down to
-    the scores.
-    """
-    train = (
-        "train",
-        "curl-noise",
-        "--size",
-        "tiny",
-        "--baseline",
-        "gns",
-        "--set",
-        "training.steps=1",
-    )
-    trained = lagbench(*train)
-    assert (
-        "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.safetensors"
-        in trained.stdout
-    )
-    assert "hint: tiny is for tests" in trained.stdout
-    assert "was over before" in lagbench(*train).stdout
-    assert "was over before" not in trained.stdout
-    predict = (
-        "predict",
-        "runs/curl-noise/tiny/gns-0/weights.safetensors",
-        "--threads",
-        "1",
-        "--no-bench",
-    )
-    assert lagbench(*predict, "--set", "model.latent=7").exit_code == 2
-    predicted = lagbench(*predict, "--set", "model.relaxation=1")
-    with netCDF4.Dataset("predictions.nc") as data:
-        assert "model.relaxation=1" in data.getncattr("training")
-    assert "without the neighbour search" in predicted.stdout
-    assert "in place of" not in predicted.stdout
-    refused = lagbench(*predict)
-    assert refused.exit_code == 2
-    assert "--overwrite" in refused.stderr
-    assert "in place of" in lagbench(*predict, "--overwrite").stdout
-    assert "next: lagbench score predictions.nc" in predicted.stdout
-    scored = lagbench("score", "predictions.nc", "--workers", "1", "--json")
-    assert "position_rmse" in json.loads(scored.stdout)["rows"]["submission"]
-    silent = ("--no-bench", "--quiet", "--threads", "1", "--overwrite")
-    assert (
-        lagbench(
-            "predict", "runs/curl-noise/tiny/gns-0/checkpoint.safetensors", *silent
-        ).stdout
-        == ""
-    )
 
 
 @pytest.mark.slow

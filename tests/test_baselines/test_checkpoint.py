@@ -10,10 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from simple_models import INFO, Drift, install
 
 from lagbench.baselines.catalogue import find, list_names
@@ -23,7 +21,6 @@ from lagbench.baselines.checkpoint import (
     check_data,
     load,
     restore,
-    round_weights,
     save,
 )
 from lagbench.baselines.dataset_info import read_dataset_info
@@ -66,25 +63,6 @@ def test_a_checkpoint_comes_back_as_it_was_stored(tmp_path: Path) -> None:
     for name, value in optimizer.items():
         assert torch.equal(loaded.optimizer[name], value)
     assert path.stat().st_size < 10**4
-
-
-def bits_of(tensor: torch.Tensor) -> NDArray[np.uint32]:
-    """Return the bits of float32 numbers."""
-    return tensor.detach().numpy().view(np.uint32)
-
-
-def test_parameters_are_rounded_to_nearest_even_and_buffers_keep_every_bit() -> None:
-    model = torch.nn.BatchNorm1d(1000)
-    generator = torch.Generator().manual_seed(0)
-    torch.nn.init.normal_(model.weight, generator=generator)
-    torch.nn.init.normal_(model.running_mean, generator=generator)
-    bits = bits_of(model.weight)
-    last_kept_bit = (bits >> 16) & 1
-    upper = (bits + 0x7FFF + last_kept_bit) >> 16
-    rounded = round_weights(model)
-    assert rounded["weight"].dtype is torch.bfloat16
-    assert np.array_equal(bits_of(rounded["weight"].float()), upper << 16)
-    assert torch.equal(rounded["running_mean"], model.running_mean)
 
 
 def a_pickle(path: Path) -> None:

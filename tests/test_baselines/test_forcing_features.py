@@ -141,37 +141,6 @@ def test_the_centre_of_an_obstacle_has_no_direction_and_no_gradient() -> None:
     assert position.grad.tolist() == [[0.0, 0.0]]
 
 
-@pytest.mark.parametrize("name", ["channel", "periodic cube"])
-def test_particles_in_an_obstacle_are_put_on_its_surface(name: str) -> None:
-    """Along the radius, also across a periodic end; the others stay to the bit."""
-    box = BOXES[name]
-    tensor_box = TensorBox(box)
-    radius = 0.1
-    centre = torch.full((box.dimension,), 0.5)
-    centre[0] = 0.95
-    rng = np.random.default_rng(2)
-    ray = rng.normal(size=(60, box.dimension))
-    ray /= np.linalg.norm(ray, axis=1)[:, None]
-    length = rng.uniform(0.01, 0.2, 60)
-    normal = torch.from_numpy(ray).float()
-    distance = torch.from_numpy(length).float()[:, None]
-    position = tensor_box.wrap(centre + distance * normal)
-    obstacle = torch.cat([centre, torch.tensor([radius])]).expand(60, -1)
-
-    moved = tensor_box.outside(position, obstacle)
-    is_outside = length > radius
-    assert torch.equal(moved[is_outside], position[is_outside])
-    surface = tensor_box.wrap(centre + radius * normal)
-    assert_close(moved[~is_outside], surface[~is_outside], rtol=0.0, atol=1e-5)
-    assert (moved[~is_outside, 0] < 0.5).any()
-    assert (moved >= 0.0).all()
-    assert (moved < 1.0).all()
-
-    moved = tensor_box.outside(centre[None], obstacle[:1])
-    way = tensor_box.displacement(centre, moved[0])
-    assert_close(way.norm(), torch.tensor(radius))
-
-
 def swirl_in(box: Box, frames: int = 7) -> NDArray[np.float64]:
     """Return particles that turn about the middle of a box, at one height in space."""
     plane = swirl(0, frames)

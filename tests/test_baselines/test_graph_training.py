@@ -173,44 +173,6 @@ def test_every_term_equals_its_equation_in_numpy(
     assert values == pytest.approx(expected, rel=tolerance)
 
 
-@pytest.mark.parametrize(
-    ("name", "other_name"),
-    [
-        ("vorticity", "divergence"),
-        ("divergence", "vorticity"),
-    ],
-)
-def test_a_linear_flow_costs_what_its_gradient_says(name: str, other_name: str) -> None:
-    """Extra rotation W costs (2 W / speed)^2 of vorticity.
-
-    Extra expansion D costs (2 D / speed)^2 of divergence. Nodes at the rim of the grid
-    average over half a stencil, so that only inner ones are exact.
-    """
-    # The particles fill the unit box evenly.
-    number = torch.arange(128).double()
-    axis = (number + 0.5) / 128
-    points = torch.cartesian_prod(axis, axis)
-    x, y = (points - 0.5).T
-    if name == "vorticity":
-        direction = torch.stack([-y, x], dim=1)
-    else:
-        direction = torch.stack([x, y], dim=1)
-    flow = 0.002 * direction
-    at_rest = torch.zeros_like(flow)
-
-    terms = compute_terms(
-        Motion(points, flow, flow),
-        Motion(points, at_rest, at_rest),
-        sample=torch.zeros(len(points), dtype=torch.int64),
-        cells=32,
-    )
-    expected = (0.004 / SPEED) ** 2
-    cost = float(terms[name])
-    assert cost == pytest.approx(expected, rel=0.02)
-    assert float(terms[other_name]) < 1e-9 * expected
-    assert float(terms["density"]) == 0.0
-
-
 def test_an_empty_window_of_vorticity_is_no_nan() -> None:
     """A splash so thin that no node has four counted neighbours costs 0, not NaN."""
     places = [[0.2, 0.2], [0.8, 0.8]]

@@ -15,9 +15,6 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import (
-    Symmetry,
-    mirror_batch,
-    mirror_matrices,
     shift_batch,
 )
 from lagbench.baselines.neuralmpm import NeuralMPM
@@ -290,51 +287,6 @@ def test_a_flow_through_the_periodic_ends_continues(name: str) -> None:
     assert greatest(error) < 1e-5
     assert float(path.min()) >= 0.0
     assert float(path.max()) < 1.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "number"),
-    [
-        ("cube", 19),
-        ("room", 30),
-    ],
-)
-def test_the_mirror_average_has_the_symmetry_of_the_cube(
-    name: str,
-    number: int,
-) -> None:
-    """The rollout of an image is the image of the rollout, with moving walls too."""
-    box = BOXES[name]
-    matrix = mirror_matrices(Symmetry.SQUARE, 3)[number]
-    frames = drift(name, 3, (0.0, 0.0, 0.0))
-    other_axes = np.roll(frames[0], 1, axis=1)
-    swirl = 0.01 * np.sin(2 * np.pi * other_axes)
-    time = np.arange(3)[:, None, None]
-    frames = box.inside(frames + time * swirl)
-    is_walled = name == "room"
-    walls = None
-    if is_walled:
-        velocity = 0.01 * torch.arange(18.0)
-        walls = velocity.view(1, 1, 6, 3)
-        walls = walls.expand(1, 3, 6, 3)
-    window = window_of(frames, walls)
-    image = mirror_batch(window, matrix[None], box.bounds)
-    model = surrogate(
-        name,
-        awake=0.1,
-        symmetry="square",
-        average=True,
-        context=2,
-        wall_velocity=is_walled,
-    )
-    path = rolled(model, window, 2)
-    image_path = rolled(model, image, 2)
-    expected = (path - 0.5) @ matrix.T + 0.5
-    difference = model.box.displacement(expected, image_path)
-    assert greatest(difference) < 3e-6
-    turned = model.box.displacement(path, image_path)
-    assert greatest(turned) > 1e-3
 
 
 def test_windows_are_shifted_along_periodic_axes_only() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import random
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -354,37 +353,3 @@ def test_the_link_loss_is_equation_5_28() -> None:
     expected = -np.mean(log_likelihood)
     loss = losses["link"].item()
     assert loss == pytest.approx(expected, rel=1e-9)
-
-
-def test_there_is_no_link_loss_in_evaluation() -> None:
-    node, edge_index, edge = small_graph()
-    layer = build_random(SuperGAT, scale=0.4).eval()
-    _, losses = layer(node.double(), edge_index, edge)
-    assert not losses
-
-
-def global_random_states() -> tuple[object, ...]:
-    """Return the states of the global generators of Python, torch and NumPy."""
-    return (
-        random.getstate(),
-        torch.get_rng_state().tolist(),
-        np.random.get_state()[1].tolist(),  # noqa: NPY002
-    )
-
-
-def test_draws_leave_global_sources_alone() -> None:
-    """SuperGAT draws from its generator only, the same for the same seed."""
-    node, edge_index, edge = small_graph()
-    node = node.double()
-    layer = build_random(SuperGAT, scale=0.4)
-
-    def link_loss(seed: int) -> float:
-        generator = seeded(seed)
-        _, losses = layer(node, edge_index, edge, generator=generator)
-        return losses["link"].item()
-
-    before = global_random_states()
-    loss = link_loss(0)
-    assert link_loss(0) == loss
-    assert link_loss(1) != loss
-    assert global_random_states() == before

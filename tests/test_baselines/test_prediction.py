@@ -17,7 +17,6 @@ import torch
 from simple_models import INFO, Bursting, Drift, install
 
 from lagbench.baselines import predict as prediction
-from lagbench.baselines import runner
 from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import Checkpoint, save
@@ -28,7 +27,6 @@ from lagbench.baselines.predict import (
 )
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out, select_window
-from lagbench.baselines.runner import WeightsRunner
 from lagbench.data.registry import Registry
 from lagbench.errors import (
     UsageError,
@@ -144,28 +142,6 @@ def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> No
         assert error.max() < 1e-6
 
 
-def test_the_file_is_valid(
-    run: Predict,
-    generated: GenerationResult,
-    unmeasured: Registry,
-) -> None:
-    result = run()
-    report = examine(result.path, root=generated.root, registry=unmeasured)
-    assert report.valid, report.findings
-
-
-def test_a_model_that_computes_on_the_cpu_stays_there(
-    run: Predict, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Scenarios side by side gain it nothing, and the time is that of the CPU."""
-    monkeypatch.setattr(prediction, "choose_device", lambda device: "cuda")
-    monkeypatch.setattr(Drift, "computes_on_cpu", True)
-    result = run(device="cuda")
-    assert result.batch == 1
-    assert result.clock == "processor"
-    assert "thread" in result.device
-
-
 def test_batches_do_not_matter(run: Predict) -> None:
     """Scenarios side by side are predicted as one by one."""
     alone = run(name="alone.nc", batch=1)
@@ -233,30 +209,6 @@ def test_frozen_frames_are_not_timed(
     result = run(model={"explode_at": 4}, batch=batch)
     assert list(result.diverged.values()) == [9, 9]
     assert result.seconds_per_frame == seconds
-
-
-def test_the_cost_of_a_rollout_that_diverges_is_that_of_the_frames_before(
-    run: Predict,
-    generated: GenerationResult,
-    unmeasured: Registry,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """With a second per step, a frame costs a second: frozen ones take no time."""
-    run(model={"explode_at": 4})
-    advance = Mock(side_effect=Drift.advance)
-    clock = SimpleNamespace(process_time=lambda: float(advance.call_count))
-    monkeypatch.setattr(Drift, "advance", lambda *given: advance(*given))
-    monkeypatch.setattr(runner, "time", clock)
-    weights_runner = WeightsRunner(
-        tmp_path / "weights.safetensors",
-        size="tiny",
-        root=generated.root,
-        registry=unmeasured,
-    )
-    scenario_file = next(generated.folder.glob("test/*.nc"))
-    assert weights_runner.time(scenario_file, 2) == 1.0
-    assert weights_runner.time(scenario_file, 10) == 1.0
 
 
 @pytest.mark.parametrize("threads", [1, 2])

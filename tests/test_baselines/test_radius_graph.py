@@ -63,32 +63,6 @@ def uniform(count: int, seed: int) -> Floats:
     return rng.random((count, 2), dtype=np.float32)
 
 
-def lattice(side: int, spacing: float) -> Floats:
-    """Return side x side particles, shape [particle, 2]."""
-    axis = np.arange(side) * spacing
-    columns, rows = np.meshgrid(axis, axis, indexing="ij")
-    points = np.stack([columns, rows], axis=-1)
-    return points.reshape(-1, 2).astype(np.float32)
-
-
-@pytest.mark.parametrize("radius", [0.004, 0.03, 0.2, 2.0])
-def test_random_particles(
-    radius: float,
-) -> None:
-    """Uniform particles, from hardly any edge to all pairs."""
-    x = uniform(400, seed=1)
-    compare_with_brute_force(x, radius)
-
-
-def test_pairs_exactly_at_the_radius_are_edges() -> None:
-    """On a lattice of 1/8 with radius 1/8 the four direct neighbours count."""
-    x = lattice(9, 0.125)
-    below = np.nextafter(0.125, 0.0)
-    # 9 x 9 particles: 2 * 9 * 8 = 144 pairs, both ways
-    assert compare_with_brute_force(x, 0.125) == 288
-    assert compare_with_brute_force(x, below) == 0
-
-
 @pytest.mark.parametrize("radius", [0.1, 0.7, 5.0])
 def test_windows_are_never_connected(radius: float) -> None:
     """The same particles in three windows have thrice the edges of one.

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from simple_models import (
     batch,
     greatest_difference,
-    info,
     jittered,
     network,
     oracle,
@@ -20,8 +19,6 @@ from simple_models import (
 )
 from torch import Tensor
 from torch.testing import assert_close
-
-from lagbench.baselines.augmentation import mirror_batch
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -88,68 +85,6 @@ def test_a_shift_away_from_walls_shifts_the_rollout() -> None:
     assert greatest_difference(path[:, 0], last) > 1e-4
     expected = path + torch.from_numpy(shift).float()
     assert_close(shifted_path, expected, rtol=0.0, atol=2e-6)
-
-
-def mirror_model(model: Any, axis: int) -> Any:
-    """Return the model whose weights see the world mirrored along an axis.
-
-    Every input that changes sign has its column negated, the two walls across have
-    their columns swapped, and the output along the axis is negated.
-    """
-    mirrored = network(awake=True, wall_velocity=True)
-    mirrored.load_state_dict(model.state_dict())
-    low = 2 * axis
-    high = 2 * axis + 1
-    with torch.no_grad():
-        node_weight = mirrored.network.node_encoder[0].weight
-        node_weight[:, axis:10:2] *= -1.0
-
-        distance = node_weight[:, 10:14]
-        from_low = distance[:, low].clone()
-        distance[:, low] = distance[:, high]
-        distance[:, high] = from_low
-
-        columns = node_weight[:, 30:]
-        wall_velocity = columns.reshape(-1, 4, 2)
-        wall_velocity[..., axis] *= -1.0
-        walls = [0, 1, 2, 3]
-        walls[low] = high
-        walls[high] = low
-        columns[:] = wall_velocity[:, walls].flatten(1)
-
-        edge_weight = mirrored.network.edge_encoder[0].weight
-        edge_weight[:, axis] *= -1.0
-        decoder = mirrored.network.decoder[-1]
-        decoder.weight[axis] *= -1.0
-        decoder.bias[axis] *= -1.0
-    return mirrored
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_mirrored_model_in_a_mirrored_world(axis: int) -> None:
-    """Walls, their motion and the weights mirrored: the rollout is the mirror image."""
-    rng = np.random.default_rng(0)
-    windows = []
-    for seed in (0, 1):
-        steps = rng.normal(0.0, 2e-3, (6, 256, 2))
-        path = steps.cumsum(axis=0)
-        windows.append(jittered(seed) + path)
-    window = batch(*windows, walls=True)
-    window.wall_velocity[1] *= -0.5
-    matrix = torch.eye(2).repeat(2, 1, 1)
-    matrix[:, axis, axis] = -1.0
-    image = mirror_batch(window, matrix, info().bounds)
-
-    model = network(awake=True, wall_velocity=True)
-    expected = rolled(model, window, 3)
-    expected[..., axis] = 1.0 - expected[..., axis]
-    mirrored = mirror_model(model, axis)
-    path = rolled(mirrored, image, 3)
-    assert_close(path, expected, rtol=0.0, atol=1e-6)
-
-    # The weights matter: the model itself does not give the mirror image.
-    unmirrored_path = rolled(model, image, 3)
-    assert greatest_difference(unmirrored_path, expected) > 1e-5
 
 
 def test_windows_side_by_side_do_not_see_each_other() -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 
-from lagbench.data.box import Box
+from lagbench.data.box import Box, keep_outside
 from lagbench.tensors import TensorBox
 
 UNIT = (0.0, 1.0)
@@ -71,3 +71,15 @@ def test_wrapped_points_lie_in_the_box_whatever_is_rounded(
     assert bool((x < end).all())
     # Between walls nothing is wrapped.
     assert torch.equal(y, position[:, 1])
+
+
+def test_points_in_an_obstacle_are_those_of_the_box_of_arrays() -> None:
+    """Across a periodic end the nearest image of the obstacle counts."""
+    obstacle = np.array([1.95, 0.5, 0.1])
+    offset = np.random.default_rng(3).normal(0.0, 0.1, (300, 2))
+    points = obstacle[:2] + offset
+    expected = CHANNEL.inside(keep_outside(points, obstacle))
+    position = torch.from_numpy(CHANNEL.inside(points))
+    own_obstacle = torch.from_numpy(obstacle).expand(300, 3)
+    moved = TensorBox(CHANNEL).outside(position, own_obstacle)
+    assert_allclose(CHANNEL.displacement(expected, moved.numpy()), 0.0, atol=1e-6)

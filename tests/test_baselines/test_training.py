@@ -19,11 +19,10 @@ import pandas as pd
 import pytest
 import torch
 from scipy.special import comb
-from simple_models import INFO, Drift, read_training_log, trainer
+from simple_models import Drift, read_training_log, trainer
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import load
-from lagbench.baselines.optimisation import Optimisation
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.train import (
     StepBatches,
@@ -108,31 +107,6 @@ def have_same_weights(first: Path, second: Path) -> bool:
         if not torch.equal(value, second_weights[name]):
             return False
     return True
-
-
-@pytest.mark.slow
-def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> None:
-    """The coefficient becomes sum(u(f) u(f+1)) / sum(u(f)^2) over train."""
-    result = run(
-        "drift",
-        "steps=250",
-        "batch=8",
-        "learning_rate=0.03",
-        "schedule=cosine",
-        "validate_every=0",
-    )
-    numerator = 0.0
-    denominator = 0.0
-    for path in generated.folder.glob("train/*.nc"):  # read without lagbench
-        with netCDF4.Dataset(path) as data:
-            position = np.asarray(data["position"][:], np.float64)
-        velocity = np.diff(position, axis=0)
-        numerator += float((velocity[1:] * velocity[:-1]).sum())
-        denominator += float((velocity[:-1] ** 2).sum())
-    coefficient = float(load(result.checkpoint).weights["a"])
-    assert coefficient == pytest.approx(numerator / denominator, abs=2e-3)
-    assert result.state == "finished"
-    assert result.parameters == 1
 
 
 @pytest.mark.parametrize(
@@ -303,15 +277,6 @@ def test_another_recipe_in_a_folder_is_refused(run: Run) -> None:
         run("drift", "steps=3")
     assert str(caught.value.where).endswith("/run")
     assert run("drift", "steps=3", fresh=True).step == 3
-
-
-def test_the_learning_rate_is_multiplied_by_the_processes() -> None:
-    """As in section 5.7.3 of the thesis."""
-    model = Drift.build({}, INFO)
-    options = TrainingOptions(steps=5, learning_rate=0.01)
-    alone = Optimisation(model, options, steps=5, processes=1)
-    three = Optimisation(model, options, steps=5, processes=3)
-    assert three.learning_rate == pytest.approx(3 * alone.learning_rate)
 
 
 def test_gradients_are_clipped(run: Run, steps_taken: list[Step]) -> None:

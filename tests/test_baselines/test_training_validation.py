@@ -5,7 +5,6 @@ training then says.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import netCDF4
@@ -15,7 +14,6 @@ import torch
 from simple_models import Drift, trainer
 
 from lagbench.baselines.checkpoint import load, restore
-from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.predict import predict
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.rollout import Validation
@@ -180,36 +178,3 @@ def test_validations_share_a_training_evenly(
     assert validated[-1] == steps
     if count > 1:
         assert validated[count // 2 - 1] == steps // 2
-
-
-def test_fewer_frames_for_tests(
-    run: Run,
-    generated: GenerationResult,
-    unmeasured: Registry,
-) -> None:
-    """`validation_frames` shortens the rollouts, and the metric is that of the shorter
-    task.
-    """
-    settings = ("steps=1", "validation_frames=4")
-    result = run("drift", *settings)
-    task = load_scored_task(
-        unmeasured.size("curl-noise", "tiny"),
-        generated.root,
-        subset="valid",
-    )
-    config = replace(task.config, horizon=4)
-    short = replace(task, config=config)
-    info = read_dataset_info(
-        "curl-noise",
-        "tiny",
-        root=generated.root,
-        registry=unmeasured,
-    )
-    model = Drift.build({}, info)
-    model.load_state_dict(dict(load(result.checkpoint).weights))
-    four_frames = dict.fromkeys(task.scenarios, 4)
-    all_frames = dict.fromkeys(task.scenarios, 20)
-    of_short = Validation(task=short, frames=four_frames).measure(model)
-    of_whole = Validation(task=task, frames=all_frames).measure(model)
-    assert of_short == result.best_value
-    assert of_whole != result.best_value

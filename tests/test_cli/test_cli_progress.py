@@ -23,16 +23,6 @@ def training_progress(step: int) -> Progress:
     )
 
 
-WRITING = Progress(
-    stage="writing train",
-    done=2,
-    total=0,
-    scenarios_done=2,
-    scenarios=0,
-    seconds=1.0,
-)
-
-
 def test_a_file_gets_lines_with_the_count_and_the_time_left(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -57,19 +47,6 @@ def test_progress_without_scenarios_is_shown_in_per_cent(
         assert listener is not None
         listener(timing)
     assert capsys.readouterr().err == "costs: 38%\n"
-
-
-def test_quick_work_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar(quiet=False, unit="steps", seconds_per_line=3600.0) as listener:
-        assert listener is not None
-        listener(training_progress(60))
-        listener(WRITING)
-    assert capsys.readouterr().err == ""
-
-
-def test_quiet_work_has_no_listener() -> None:
-    with progress_bar(quiet=True) as listener:
-        assert listener is None
 
 
 def test_work_goes_on_without_stderr(monkeypatch: pytest.MonkeyPatch) -> None:

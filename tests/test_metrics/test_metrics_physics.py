@@ -16,7 +16,6 @@ from metric_flows import (
     measured,
     pair_of,
     pairs_of,
-    rollout,
     scenario_of,
     swirl,
 )
@@ -183,18 +182,3 @@ def test_fields_of_an_expansion_and_of_missing_material() -> None:
     assert density[3:-3, 3:-3] == pytest.approx(1.0)
     expected = math.sqrt(np.mean(density**2))
     assert measure(pair, "density_rmse") == pytest.approx(expected)
-
-
-def test_observables_of_the_truth_do_not_depend_on_the_prediction() -> None:
-    """What is shown of the truth is the same beside any prediction."""
-    truth = rollout()
-    rng = np.random.default_rng(3)
-    noise = 0.01 * rng.standard_normal(truth.shape)
-    ours = scores_of(truth, truth)
-    theirs = scores_of(truth, truth + noise)
-    for name in (
-        "energy_true",
-        "energy_retention_true",
-        "divergence_rms_true",
-    ):
-        assert ours[name].mean == theirs[name].mean

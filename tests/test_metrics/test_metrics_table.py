@@ -6,7 +6,6 @@ import functools
 import itertools
 import math
 import pickle
-import re
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -43,7 +42,6 @@ from lagbench.metrics import (
     tally,
 )
 from lagbench.metrics import table as table_module
-from lagbench.metrics.metric import FirstFrames, last
 
 ALL = select()
 MATERIAL = np.arange(400) // 200  # half liquid, half jelly
@@ -202,33 +200,6 @@ def test_undefined_frames_and_scenarios_are_left_out_and_counted(
     assert_equal(correlation.interval, bootstrap_interval(correlation.values))
 
 
-@pytest.mark.parametrize("holes", [0, 3])
-def test_means_of_many_frames_have_the_bits_of_one_at_a_time(holes: int) -> None:
-    """However many scenarios are reduced at once; 1201 frames are summed in blocks."""
-    rng = np.random.Generator(np.random.PCG64(5))
-    values = 10.0 ** rng.uniform(-8, 8, (5, 1201))
-    values[0, :holes] = math.nan
-    tallies = {}
-    means = []
-    for scenario, row in enumerate(values):
-        tallies[scenario] = of_pearson(*row)
-        is_defined = ~np.isnan(row)
-        defined = row[is_defined].copy()
-        means.append(np.mean(defined))
-    correlation = score(METRICS["vorticity_pearson"], tallies)
-    assert_array_equal(correlation.values, means)
-
-
-def test_a_horizon_beyond_the_series_is_undefined() -> None:
-    """The mean of the first five of three frames does not exist; of the first two it
-    does.
-    """
-    series = np.arange(3.0)
-    assert math.isnan(FirstFrames(5)(series))
-    assert FirstFrames(2)(series) == 0.5
-    assert FirstFrames(2, last)(series) == 1.0
-
-
 def test_tallies_add() -> None:
     """A worker that counted as lost and comes back adds weight, not error."""
     once = tallied()
@@ -241,14 +212,7 @@ def test_tallies_add() -> None:
         Tally.of(["vorticity_mse"], [2], {3: {"vorticity_mse": 1.0}})
 
 
-NAMES = sorted(METRICS)
 MEASURED = select(known=METRICS)  # Sinkhorn, optional and slow, has tests of its own
-LENGTHS = re.compile(
-    r"(1|%|nat|frame|(mass(\^2)? )?length(\^[24])?(/frame(\^[24])?)?|1/frame(\^2)?)"
-)
-SOURCES = re.compile(
-    r"Eqs?\. \d|Figs?\. \d|section \d|.* \(?(19|20)\d\d\b|docs/scoring\.md"
-)
 STATES = ("liquid", "jelly", "snow", "rope")
 
 
@@ -279,24 +243,6 @@ def scores(size: float) -> dict[str, Score]:
         scores_of_box = aggregate(MEASURED, {0: pieces})
         scores_of_boxes = scores_of_box | scores_of_boxes
     return scores_of_boxes
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_metric_has_a_full_description(name: str) -> None:
-    """Name, family, unit, direction and source are well formed; the summary is one line
-    without a stop.
-    """
-    metric = METRICS[name]
-    assert metric.name == name
-    assert re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name)
-    assert metric in FAMILIES[metric.family]
-    assert LENGTHS.fullmatch(metric.unit), metric.unit
-    assert SOURCES.match(metric.source)
-    assert re.fullmatch(r"[A-Z0-9].{7,98}[^.]", metric.summary)
-    for needed in metric.of:
-        assert needed in METRICS
-    if metric.direction is Direction.NONE:
-        assert metric.perfect is None
 
 
 JUDGED = [metric for metric in MEASURED if metric.direction is not Direction.NONE]

@@ -353,11 +353,6 @@ def first_value(value: object) -> dict[str, Any]:
     return {"rows": rows_of([value, *ONES[1:]])}
 
 
-def undefined_frames(*undefined: float) -> dict[str, Any]:
-    """Return changes after which so many frames of each scenario are undefined."""
-    return {"rows": rows_of(ONES, list(undefined))}
-
-
 def scenario_ids(*ids: object) -> dict[str, Any]:
     """Return changes after which the scenarios have other ids."""
     return {"task": {"scenarios": list(ids)}}
