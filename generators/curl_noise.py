@@ -74,7 +74,8 @@ def stream_function(
         from_low.append(along.shift(-low).scale(per_length))
         from_high.append(along.scale(-1.0).shift(high).scale(per_length))
 
-    psi = noise(*from_low, lattice)
+    x, y = from_low
+    psi = noise(x, y, lattice)
     for distance in (*from_low, *from_high):
         psi = psi * ramp(distance.scale(2.0))
     return psi.scale(scale * width)

@@ -153,6 +153,14 @@ class FreeSurfaceKernels:
         """Advance every scenario by one substep: one launch per phase."""
         raise NotImplementedError
 
+    def determinant(self, s: i32, p: i32) -> f32:
+        """Return det F of a particle."""
+        raise NotImplementedError
+
+    def divergence(self, s: i32, p: i32) -> f32:
+        """Return tr C of a particle."""
+        raise NotImplementedError
+
     @ti.kernel
     def restart_extremes(self) -> Nothing:
         """Start an advance: the extremes are those of the present state.

@@ -87,7 +87,7 @@ class Smooth:
             factors[:, None, None] * self.hessian,
         )
 
-    def shift(self, amount: NDArray[np.number] | float) -> Smooth:
+    def shift(self, amount: Array | NDArray[np.int64] | float) -> Smooth:
         """Add numbers that do not depend on the point's coordinates."""
         return Smooth(self.value + amount, self.gradient, self.hessian)
 
