@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from lagbench.baselines.train import train
     from lagbench.board.submit import submit
     from lagbench.exchange.adoption import adopt
-    from lagbench.figures.pictures import animate, plot
+    from lagbench.figures.animate import animate
+    from lagbench.figures.pictures import plot
     from lagbench.make.generate import generate
     from lagbench.make.verify import verify
     from lagbench.scoring.compare import compare
@@ -66,7 +67,7 @@ _MODULES = {
     "predict": "baselines.predict",
     "submit": "board.submit",
     "plot": "figures.pictures",
-    "animate": "figures.pictures",
+    "animate": "figures.animate",
     "adopt": "exchange.adoption",
 }
 

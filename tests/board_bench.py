@@ -24,7 +24,6 @@ from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import format_yaml
-from lagbench.figures.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.task import ScoredTask, load_scored_task
@@ -84,22 +83,6 @@ class ReportBench:
             registry=self.registry,
             workers=1,
             write=False,
-        )
-
-    def report(self, folder: Path, files: Mapping[str, Method]) -> Path:
-        """Submit, score and report methods by name."""
-        folder.mkdir(parents=True, exist_ok=True)
-        paths = []
-        for number, (name, method) in enumerate(files.items()):
-            path = self.submit(folder / f"{number}.nc", method, name)
-            paths.append(path)
-        cards = [self.card(path) for path in paths]
-        return write_report(
-            folder / "report",
-            cards,
-            paths,
-            root=self.root,
-            registry=self.registry,
         )
 
 

@@ -31,15 +31,6 @@ class Reading:
         """Return the elements of a name."""
         return [element for element in self.elements if element.name == name]
 
-    def of_class(self, kind: str) -> list[Element]:
-        """Return the elements of a class."""
-        matches = []
-        for element in self.elements:
-            classes = element.attributes.get("class", "").split()
-            if kind in classes:
-                matches.append(element)
-        return matches
-
     @property
     def ids(self) -> list[str]:
         """All ids in order."""

@@ -9,14 +9,15 @@ from cyclopts.types import PositiveInt
 from lagbench.data.local import locate
 from lagbench.errors import UsageError
 from lagbench.exchange.viewing import view
+from lagbench.figures.animate import animate
 from lagbench.figures.pictures import (
-    animate,
     data_name,
     find_scenario,
     plot,
     require_place,
 )
 from lagbench.figures.plot import contact_sheet
+from lagbench.store.copy import update_working_copy
 
 from .options import (
     JsonFlag,
@@ -63,12 +64,13 @@ def plot_command(
                 "a sheet shows many scenarios and frames; leave --scenario and --frame "
                 "out, or --sheet"
             )
-        tier = locate(split, size, root=root).size
+        tier, folder, splits = locate(split, size, root=root)
         page = Path(f"{tier.split}-{tier.name}-sheet.png")
         if output is not None:
             page = output
         require_place(page, overwrite=overwrite)
-        path = contact_sheet(split, tier.name, page, root=root, kind=kind)
+        update_working_copy(tier, folder, tier.scenarios)
+        path = contact_sheet(tier, folder, page, registry=splits, kind=kind)
     else:
         file = find_scenario(split, size=size, scenario=scenario, root=root)
         path = output or Path(f"{data_name(file)}.png")

@@ -6,8 +6,10 @@ time. Files appear whole or not at all, and the same frames give the same bytes.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,7 @@ from rich.console import Console
 from rich.progress import track
 
 from lagbench.atomic import atomic_path
+from lagbench.data.layout import expand_home
 from lagbench.errors import UsageError, require
 from lagbench.work.run import watched
 
@@ -33,6 +36,7 @@ from .panels import (
     name_slice,
     strongest_limit,
 )
+from .pictures import data_name, find_scenario, require_place
 from .plot import SEPARATOR, describe
 from .recording import Recording, open_recording
 
@@ -64,38 +68,63 @@ SHORTEST_DELAY = 20  # viewers slow a GIF down below two hundredths of a second 
 
 def animate(
     source: str | Path,
-    output: str | Path,
     *,
-    beside: str | Path | None = None,
+    size: str | None = None,
+    scenario: int | None = None,
+    beside: int | str | Path | None = None,
     kind: Panel | str | None = None,
     frames_per_second: float = 30.0,
     every: int = 1,
+    output: str | Path | None = None,
+    overwrite: bool = False,
+    root: str | Path | None = None,
     quiet: bool = False,
     registry: Registry | None = None,
 ) -> Path:
-    """Turn a scenario into an MP4 or GIF file; return its path.
+    """Make a film of a scenario, or of two side by side; return its path.
 
     Args:
-        source: scenario file.
-        output: file to write, ending in .mp4 or .gif.
-        beside: second scenario file, drawn to the right with the same colour scale;
-            frames are matched by number and end with the shorter of the two.
+        source: name of the split, path of a local split's folder, or a scenario file.
+        size: name of the size; as :func:`lagbench.open_split` picks it when None.
+        scenario: scenario id, where the source is a split; the first one of test when
+            None.
+        beside: id of a second scenario of the split, or another scenario file; it is
+            drawn to the right with the same colour scale, and the film ends with the
+            shorter of the two.
         kind: one of :data:`KINDS`; material where there are several, else speed, when
             None.
-        frames_per_second: frames shown per second, 0.01 to 1000; a GIF rounds to
+        frames_per_second: frames shown per second [1/s], 0.01 to 1000; a GIF rounds to
             hundredths of a second.
         every: show every n-th frame.
+        output: file to write, ending in .mp4 or .gif; named after the data in the
+            working folder when None.
+        overwrite: whether to replace a file of that name.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         quiet: show no progress; without a terminal on stderr none is shown anyway.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown kind or ending, a rate out of bounds, a step that is not
-            positive, no matplotlib.
-        DataError: a scenario file is missing or damaged.
+        UsageError: unknown split, size, scenario or kind, another ending, a rate out of
+            bounds, no such folder, a file that must not be replaced, no matplotlib.
+        DataError: a scenario is not on this machine, or damaged.
         WorkFailedError: the video cannot be encoded or written.
     """
-    path = Path(output)
-    check_ending(path)
+    find = partial(find_scenario, source, size=size, root=root, registry=registry)
+    sources = [find(scenario=scenario)]
+    if isinstance(beside, str | Path):
+        sources.append(expand_home(beside, "beside"))
+    elif beside is not None:
+        sources.append(find(scenario=operator.index(beside)))
+    path = Path(f"{data_name(sources[0])}.mp4")
+    if output is not None:
+        path = expand_home(output, "output")
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(
+            f"films are MP4 or GIF files, not {path.name}; name it "
+            f"{path.stem or 'film'}.mp4",
+            where="--output",
+        )
+    require_place(path, overwrite=overwrite)
     if kind is not None and kind not in KINDS:
         raise UsageError(
             f"a film cannot show {str(kind)!r}; choose {', '.join(KINDS)}",
@@ -109,9 +138,6 @@ def animate(
         )
     if every < 1:
         raise UsageError(f"no step of {every} frames; give 1 or more", where="--every")
-    sources = [source]
-    if beside is not None:
-        sources.append(beside)
 
     with ExitStack() as stack:
         recordings = []
@@ -139,20 +165,6 @@ def animate(
         else:
             _encode_mp4(temporary, frames, rate=frames_per_second)
     return path
-
-
-def check_ending(path: Path) -> None:
-    """Refuse a file name that has not the ending of a film.
-
-    Raises:
-        UsageError: the name ends in none of :data:`SUFFIXES`.
-    """
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(
-            f"films are MP4 or GIF files, not {path.name}; name it "
-            f"{path.stem or 'film'}.mp4",
-            where="--output",
-        )
 
 
 def _encode_mp4(

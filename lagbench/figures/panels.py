@@ -167,10 +167,20 @@ def draw(
         limit: top of the colour scale.
         detail: how dense and thick streamlines are, 0 to 1.
     """
-    _draw_box(axes, panel, scene)
-    scale = colour_scale(panel, limit, is_solid=scene.recording.is_solid)
+    # as seen from above, as a cube, cut by a plane, or as seen from the front
+    recording = scene.recording
+    if panel is Panel.ABOVE:
+        draw_walls(axes, recording, scene.frame, plane=(0, 2))
+    elif recording.is_solid and panel in (Panel.MATERIAL, Panel.SPEED):
+        draw_cube(axes, recording, scene.frame)
+    elif recording.is_solid and panel not in OF_PARTICLES:
+        draw_walls(axes, recording, scene.frame, cut=place_of_slice(scene))
+    else:
+        draw_walls(axes, recording, scene.frame)
+
+    scale = colour_scale(panel, limit, is_solid=recording.is_solid)
     if panel is Panel.MATERIAL:
-        colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
+        colours = np.array(MATERIAL_COLOURS)[recording.material]
         _draw_dots(axes, scene, colours, panel)
     elif panel in OF_PARTICLES:
         colours = scale.to_rgba(scene.speed)
@@ -182,22 +192,6 @@ def draw(
         speed = np.where(scene.fields.counted, _grid_speed(scene), np.nan)
         _draw_field(axes, scene, speed, scale)
         _draw_streamlines(axes, scene, detail=detail)
-
-
-def _draw_box(axes: Axes, panel: Panel, scene: Scene) -> None:
-    """Draw the box of a panel: as seen from above, as a cube, cut by a plane, or as
-    seen from the front, where the plane of x and y is.
-    """
-    recording = scene.recording
-    if panel is Panel.ABOVE:
-        draw_walls(axes, recording, scene.frame, plane=(0, 2))
-    elif recording.is_solid and panel in (Panel.MATERIAL, Panel.SPEED):
-        draw_cube(axes, recording, scene.frame)
-    elif recording.is_solid and panel not in OF_PARTICLES:
-        cut = place_of_slice(scene)
-        draw_walls(axes, recording, scene.frame, cut=cut)
-    else:
-        draw_walls(axes, recording, scene.frame)
 
 
 def box_of(
@@ -358,7 +352,19 @@ def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any], panel: Panel) ->
     dot_diameter = DOT_DIAMETER
     if recording.is_solid:
         dot_diameter = DOT_DIAMETER_SOLID
-        place, depth, scale = _project(recording, position, panel)
+        low, high = np.transpose(recording.size.box.bounds)
+        share = np.clip((position - low) / (high - low), 0.0, 1.0)
+        if panel is Panel.FRONT:
+            place = position[:, :2]
+            depth = VIEW_FADE * share[:, 2]
+        elif panel is Panel.ABOVE:
+            place = position[:, [0, 2]]
+            depth = VIEW_FADE * (1.0 - share[:, 1])
+        else:
+            view = View(recording.size.box)
+            place = view.place(position)
+            depth = view.depth(position)
+            scale = view.scale
         order = np.argsort(-depth, kind="stable")
         matplotlib_colors = require("matplotlib.colors", extra="plots")
         rgb = matplotlib_colors.to_rgba_array(colours)[order, :3]
@@ -382,28 +388,6 @@ def _side_of(axes: Axes) -> float:
     assert drawn is not None  # axes stand in a figure
     width: float = drawn.get_figwidth()  # type: ignore[union-attr]
     return float(axes.get_position().width * width)
-
-
-def _project(
-    recording: Recording, position: Floats, panel: Panel
-) -> tuple[Floats, Floats, float]:
-    """Return where points stand in a panel, how deep they lie, and its scale.
-
-    Places have the shape [particle, 2], depths from 0 to 1 the shape [particle]. The
-    scale is in sides of the panel per length.
-    """
-    if panel not in VIEWS:
-        view = View(recording.size.box)
-        return view.place(position), view.depth(position), view.scale
-    low, high = np.transpose(recording.size.box.bounds)
-    share = np.clip((position - low) / (high - low), 0.0, 1.0)
-    if panel is Panel.FRONT:
-        place = position[:, :2]
-        depth = VIEW_FADE * share[:, 2]
-    else:
-        place = position[:, [0, 2]]
-        depth = VIEW_FADE * (1.0 - share[:, 1])
-    return place, depth, 1.0
 
 
 def _box_patch(

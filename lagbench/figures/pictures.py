@@ -1,24 +1,17 @@
-"""Pictures and films of the scenarios of a split, found by the split's name.
-
-:mod:`.plot` and :mod:`.animate` draw a scenario file that is given.
-"""
+"""Pictures of the scenarios of a split, found by the split's name."""
 
 from __future__ import annotations
 
-import operator
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagbench.atomic import check_output_file
 from lagbench.data.layout import expand_home
 from lagbench.data.local import locate, suggest_repair
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, UsageError
 from lagbench.store.copy import update_working_copy
 
-from . import animate as films
 from .canvas import DPI, check_picture_name, save
 from .plot import ALL, check_kind, draw_frame
 
@@ -67,7 +60,6 @@ def plot(
         UsageError: unknown split, size, scenario, kind or frame, another ending, no
             such folder, a file that must not be replaced, no matplotlib.
         DataError: the scenario is not on this machine, or damaged.
-        UnreadableFileError: the named file is no scenario file.
     """
     check_kind(kind)
     file = find_scenario(
@@ -77,85 +69,10 @@ def plot(
     if output is not None:
         path = check_picture_name(expand_home(output, "output"))
         require_place(path, overwrite=overwrite)
-    with _blame_named_files(source):
-        drawn = draw_frame(file, frame, kind=kind, dpi=dpi, registry=registry)
+    drawn = draw_frame(file, frame, kind=kind, dpi=dpi, registry=registry)
     if path is not None:
         save(drawn, path)
     return drawn
-
-
-def animate(
-    source: str | Path,
-    *,
-    size: str | None = None,
-    scenario: int | None = None,
-    beside: int | str | Path | None = None,
-    kind: str | None = None,
-    frames_per_second: float = 30.0,
-    every: int = 1,
-    output: str | Path | None = None,
-    overwrite: bool = False,
-    root: str | Path | None = None,
-    quiet: bool = False,
-    registry: Registry | None = None,
-) -> Path:
-    """Make a film of a scenario, or of two side by side; return its path.
-
-    Args:
-        source: name of the split, path of a local split's folder, or a scenario file.
-        size: name of the size; as :func:`lagbench.open_split` picks it when None.
-        scenario: scenario id, where the source is a split; the first one of test when
-            None.
-        beside: id of a second scenario of the split, or another scenario file.
-        kind: speed, material or vorticity; material where there are several, else
-            speed, when None.
-        frames_per_second: frames shown per second [1/s], 0.01 to 1000.
-        every: show every n-th frame.
-        output: file to write, ending in .mp4 or .gif; named after the data in the
-            working folder when None.
-        overwrite: whether to replace a file of that name.
-        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
-        quiet: show no progress; without a terminal on stderr none is shown anyway.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: unknown split, size, scenario or kind, another ending, a rate out of
-            bounds, no such folder, a file that must not be replaced, no matplotlib.
-        DataError: a scenario is not on this machine, or damaged.
-        UnreadableFileError: a named file is no scenario file.
-        WorkFailedError: the video cannot be encoded or written.
-    """
-    file = find_scenario(
-        source, size=size, scenario=scenario, root=root, registry=registry
-    )
-    second: Path | None = None
-    if isinstance(beside, str | Path):
-        second = expand_home(beside, "beside")
-    elif beside is not None:
-        second = find_scenario(
-            source,
-            size=size,
-            scenario=operator.index(beside),
-            root=root,
-            registry=registry,
-        )
-    if output is None:
-        path = Path(f"{data_name(file)}.mp4")
-    else:
-        path = expand_home(output, "output")
-    films.check_ending(path)
-    require_place(path, overwrite=overwrite)
-    with _blame_named_files(source, beside):
-        return films.animate(
-            file,
-            path,
-            beside=second,
-            kind=kind,
-            frames_per_second=frames_per_second,
-            every=operator.index(every),
-            quiet=quiet,
-            registry=registry,
-        )
 
 
 def find_scenario(
@@ -172,7 +89,7 @@ def find_scenario(
         UsageError: no such split, size or scenario, or an id beside a file.
         DataError: the scenario is not on this machine.
     """
-    if _is_file(source):
+    if str(source).endswith(SCENARIO_ENDING):
         if scenario is not None:
             raise UsageError(
                 f"{source} holds one scenario, and {scenario} names another; leave one "
@@ -193,29 +110,6 @@ def find_scenario(
         fix = suggest_repair(tier, repair, root=folder)
         raise DataError(f"scenario {scenario_id} is not there: no {path}; {fix}")
     return path
-
-
-def _is_file(source: str | Path) -> bool:
-    """Return whether a user names a scenario file, not a split."""
-    return str(source).endswith(SCENARIO_ENDING)
-
-
-@contextmanager
-def _blame_named_files(*sources: object) -> Iterator[None]:
-    """Turn errors of damaged data into errors of the files that the user named.
-
-    Raises:
-        UnreadableFileError: a named file cannot be read or is no scenario file.
-        DataError: a file of a data set is damaged.
-    """
-    try:
-        yield
-    except DataError as error:
-        place = error.where or ""
-        for source in sources:
-            if isinstance(source, str | Path) and place.startswith(str(source)):
-                raise UnreadableFileError(error.text, where=error.where) from error
-        raise
 
 
 def require_place(path: Path, *, overwrite: bool) -> None:

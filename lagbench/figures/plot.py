@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lagbench.data.box import WALL_NAMES
-from lagbench.data.local import locate, suggest_repair
+from lagbench.data.local import suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError
-from lagbench.store.copy import update_working_copy
 
 from .canvas import DPI, draw_header, figure, save, shrink
 from .colours import MUTED
@@ -33,7 +32,13 @@ from .panels import (
     strongest_limit,
     title_of,
 )
-from .recording import Recording, Scene, name_start, open_recording
+from .recording import (
+    KIND_PARAMETERS,
+    Recording,
+    Scene,
+    describe_parameters,
+    open_recording,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,7 +48,6 @@ KINDS = (ALL, *(str(panel) for panel in Panel))
 """What :func:`draw_frame` can draw."""
 
 SEPARATOR = "  ·  "
-KIND_PARAMETERS = ("family", "pair")  # parameters that say of which kind a scenario is
 # along each axis, against it and with it
 DIRECTIONS = (("left", "right"), ("down", "up"), ("forward", "back"))
 
@@ -172,7 +176,7 @@ def describe(recording: Recording) -> str:
     parts = [
         f"{recording.size.split} {recording.size.name}",
         f"scenario {recording.scenario}",
-        *_describe_parameters(recording),
+        *describe_parameters(recording.parameters),
     ]
     return SEPARATOR.join(parts)
 
@@ -196,64 +200,13 @@ def _describe_scene(scene: Scene) -> str:
     return SEPARATOR.join(parts)
 
 
-def _describe_parameters(recording: Recording) -> list[str]:
-    """Return Reynolds number, kind and start of the flow, those that there are."""
-    parts = []
-    if recording.reynolds is not None:
-        parts.append(f"Re {recording.reynolds:.0f}")
-    for name in KIND_PARAMETERS:
-        if name in recording.parameters:
-            parts.append(f"{name} {recording.parameters[name]}")
-    start = name_start(recording.parameters)
-    if start:
-        parts.append(start)
-    return parts
-
-
 def contact_sheet(
-    split: str,
-    size: str,
-    output: str | Path,
-    *,
-    root: str | Path | None = None,
-    kind: Panel | str | None = None,
-    dpi: float = DPI,
-    registry: Registry | None = None,
-) -> Path:
-    """Draw scenarios of a split over time on one page; return the path of the file.
-
-    Args:
-        split: name of the split.
-        size: name of the size.
-        output: file to write, ending in .png, .pdf or .svg.
-        root: folder that holds all data sets; see ``resolve_root``.
-        kind: what each panel shows; the default, as ``all``, suits the split.
-        dpi: pixels per inch.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: unknown split, size or kind, no matplotlib.
-        DataError: no scenario is there, or a file is damaged.
-    """
-    tier, folder, splits = locate(split, size, root=root, registry=registry)
-    update_working_copy(tier, folder, tier.scenarios)
-    panel = None
-    if kind is not None and kind != ALL:
-        check_kind(kind)
-        panel = Panel(kind)
-        _check_view(panel, tier)
-    return draw_contact_sheet(
-        tier, folder, output, registry=splits, panel=panel, dpi=dpi
-    )
-
-
-def draw_contact_sheet(
     tier: Size,
     folder: Path,
     output: str | Path,
     *,
     registry: Registry,
-    panel: Panel | None = None,
+    kind: str = ALL,
     dpi: float = DPI,
     option: str = "--output",
 ) -> Path:
@@ -267,13 +220,17 @@ def draw_contact_sheet(
         folder: folder that holds all data sets.
         output: file to write, ending in .png, .pdf or .svg.
         registry: where splits are described.
-        panel: what each panel shows; the default suits the split.
+        kind: what each panel shows; ``all`` stands for what suits the split.
         dpi: pixels per inch.
         option: the option that names another place, for messages.
 
     Raises:
+        UsageError: unknown kind, no matplotlib.
         DataError: no scenario is there, or a file is damaged.
     """
+    check_kind(kind)
+    if kind != ALL:
+        _check_view(Panel(kind), tier)
     files = []
     for ids in tier.subsets.values():
         paths = [tier.path(folder, scenario) for scenario in sorted(ids)]
@@ -285,17 +242,18 @@ def draw_contact_sheet(
         )
     chosen = _first_of_each_kind(files, registry)
     rows = []
-    for kind, path in chosen.items():
+    for mark, path in chosen.items():
         with open_recording(path, registry=registry) as recording:
             scenes = [recording.scene(n) for n in choose_moments(recording.frames)]
-        rows.append((f"{recording.scenario}  {kind}", scenes))
+        rows.append((f"{recording.scenario}  {mark}", scenes))
     first = rows[0][1][0].recording
-    if panel is None:
-        panel = Panel.SPEED
-        if any(scenes[0].recording.is_mixed for _, scenes in rows):
-            panel = Panel.MATERIAL
-        elif tier.is_full_box:
-            panel = Panel.VORTICITY
+    panel = Panel.SPEED
+    if kind != ALL:
+        panel = Panel(kind)
+    elif any(scenes[0].recording.is_mixed for _, scenes in rows):
+        panel = Panel.MATERIAL
+    elif tier.is_full_box:
+        panel = Panel.VORTICITY
     limits = []
     for _, scenes in rows:
         limits += [limit_of(panel, scene) for scene in scenes]
@@ -348,7 +306,7 @@ def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Pa
     others: dict[str, Path] = {}
     for path in files:
         with open_recording(path, registry=splits) as recording:
-            marks = _describe_parameters(recording)
+            marks = describe_parameters(recording.parameters)
         for name in KIND_PARAMETERS:
             if name in recording.parameters:
                 kinds.setdefault(str(recording.parameters[name]), path)

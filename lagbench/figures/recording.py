@@ -23,6 +23,9 @@ from lagbench.errors import UsageError
 # folders between the root of all data sets and a scenario file
 DEPTH = 4
 
+KIND_PARAMETERS = ("family", "pair")
+"""Parameters that say of which kind a scenario is."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -181,14 +184,6 @@ class Recording:
         self.layer = int(order[0])
 
     @property
-    def reynolds(self) -> float | None:
-        """Reynolds number, None where there is none."""
-        value = self.parameters.get("reynolds_number")
-        if value is None:
-            return None
-        return float(str(value))
-
-    @property
     def is_mixed(self) -> bool:
         """Whether the scenario has several materials."""
         return np.unique(self.material).size > 1
@@ -239,16 +234,22 @@ class Recording:
         return self._read(name, frame).astype(np.float64)
 
 
-def name_start(parameters: Mapping[str, Any]) -> str:
-    """Return how a flow starts, as in "frequency 3"; empty where nothing says so.
+def describe_parameters(parameters: Mapping[str, Any]) -> list[str]:
+    """Return Reynolds number, kind and start of a flow, as far as they are stated.
 
     A flow of vortex rings has no frequency: its files state 0.
     """
+    parts = []
+    if parameters.get("reynolds_number") is not None:
+        parts.append(f"Re {float(str(parameters['reynolds_number'])):.0f}")
+    for name in KIND_PARAMETERS:
+        if name in parameters:
+            parts.append(f"{name} {parameters[name]}")
     if parameters.get("kind") == "rings":
-        return "vortex rings"
-    if "frequency" in parameters:
-        return f"frequency {parameters['frequency']}"
-    return ""
+        parts.append("vortex rings")
+    elif "frequency" in parameters:
+        parts.append(f"frequency {parameters['frequency']}")
+    return parts
 
 
 @contextmanager

@@ -105,12 +105,12 @@ def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> 
     """Paint a contact sheet of all scenarios and one frame of a test scenario."""
     # the drawing modules are loaded only where there is something to paint
     from lagbench.figures.canvas import save
-    from lagbench.figures.plot import draw_contact_sheet, draw_frame
+    from lagbench.figures.plot import contact_sheet, draw_frame
 
     registry = Registry({size.split: split}, {})
     folder = size.folder(root)
     sheet_name, frame_name = PICTURES
-    draw_contact_sheet(
+    contact_sheet(
         size, root, folder / sheet_name, registry=registry, option=ROOT_OPTION
     )
 

@@ -30,13 +30,13 @@ def swirl(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_mp4_has_every_frame_and_the_same_bytes_twice(
     swirl: Path, tmp_path: Path
 ) -> None:
-    path = animate(swirl, tmp_path / "film.mp4", frames_per_second=10)
+    path = animate(swirl, output=tmp_path / "film.mp4", frames_per_second=10)
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
     assert frames == 4
     assert seconds == pytest.approx(0.4)
     meta = next(imageio_ffmpeg.read_frames(str(path)))
     assert meta["size"] == (WIDTH, HEIGHT)
-    again = animate(swirl, tmp_path / "again.mp4", frames_per_second=10)
+    again = animate(swirl, output=tmp_path / "again.mp4", frames_per_second=10)
     assert again.read_bytes() == path.read_bytes()
 
 
@@ -44,8 +44,8 @@ def test_gif_repeats_and_ends_with_the_shorter_of_two(
     swirl: Path, tmp_path: Path
 ) -> None:
     other = write_swirl(tmp_path, frames=3)
-    path = animate(swirl, tmp_path / "film.gif", beside=other)
-    again = animate(swirl, tmp_path / "again.gif", beside=other)
+    path = animate(swirl, output=tmp_path / "film.gif", beside=other)
+    again = animate(swirl, output=tmp_path / "again.gif", beside=other)
     assert again.read_bytes() == path.read_bytes()
     with GifImageFile(path) as image:
         assert image.info["loop"] == 0
@@ -69,7 +69,7 @@ def test_an_error_leaves_no_file(swirl: Path, tmp_path: Path) -> None:
     target.mkdir()
     for ending in (".mp4", ".gif"):
         with pytest.raises(Exception, match=r"damaged\.nc"):
-            animate(damaged, target / f"film{ending}")
+            animate(damaged, output=target / f"film{ending}")
     assert not list(target.iterdir())
 
 
@@ -86,5 +86,5 @@ def test_settings_out_of_range_are_refused(
     swirl: Path, tmp_path: Path, settings: dict[str, object], where: str
 ) -> None:
     with pytest.raises(UsageError) as caught:
-        animate(swirl, tmp_path / "film.gif", **settings)  # type: ignore[arg-type]
+        animate(swirl, output=tmp_path / "film.gif", **settings)  # type: ignore[arg-type]
     assert caught.value.where == where

@@ -8,10 +8,8 @@ import hashlib
 import importlib.util
 import json
 import re
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,13 +23,11 @@ from lagbench.data.manifest import (
     Manifest,
     build_manifest,
     describe_file,
-    read_or_empty,
 )
 from lagbench.data.registry import Size
 from lagbench.figures.tables import escape
 from lagbench.make import cards
 from lagbench.make.croissant import croissant_json
-from lagbench.make.generate import GenerationResult
 
 STATISTICS = {
     "position_mean": (0.5, 0.25),
@@ -178,48 +174,6 @@ def test_the_card_says_all_that_it_must(folder: Path) -> None:
     assert escape(citation) in body
 
 
-def test_every_picture_of_the_card_is_there(folder: Path) -> None:
-    """Links resolve, and each picture has words in its place."""
-    text = (folder / "README.md").read_text()
-    links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", text)
-    targets = [target for _, target in links]
-    assert targets == list(PICTURES)
-    for words, target in links:
-        assert len(words) > 10
-        picture = (folder / target).read_bytes()
-        assert len(picture) < 300_000
-        assert picture.startswith(b"\x89PNG")
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("as_shipped")
-def test_estimates_hold_the_bytes_of_a_real_card(
-    tmp_path: Path, tiny_split: Callable[..., GenerationResult]
-) -> None:
-    """What is on disk beside the scenarios, pictures included, takes less than the
-    estimate, and not much less. Pictures of three dimensions have the most bytes.
-    """
-    split = "cavity-3d"
-    generated = tiny_split(split)
-    root = tmp_path / "root"
-    shutil.copytree(generated.root, root)
-    size = registry.load().size(split, "tiny")
-    manifest = read_or_empty(size, root)
-    # Those of shared data are blank, and stay where the card is that of the data.
-    for name in PICTURES:
-        (size.folder(root) / name).unlink()
-    write(root, size, manifest)
-
-    real = 0
-    for path in size.folder(root).rglob("*"):
-        if path.is_file() and path.suffix != ".nc":
-            real += path.stat().st_size
-    scenarios = [entry.scenario for entry in manifest.files]
-    files = sum(size.file_bytes(scenario) for scenario in scenarios)
-    estimate = size.data_set_bytes(scenarios) - files
-    assert real < estimate < 4 * real
-
-
 def written_cards(root: Path, size: Size, manifest: Manifest) -> dict[Path, bytes]:
     """Write cards and return the content of their files."""
     return {path: path.read_bytes() for path in write(root, size, manifest)}
@@ -244,20 +198,6 @@ def test_the_same_manifest_gives_the_same_bytes(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.partial"))
 
 
-def test_tables_have_as_many_cells_as_their_heads(folder: Path) -> None:
-    """No value breaks a table: every row of a block has the same number of unescaped
-    bars.
-    """
-    text = (folder / "README.md").read_text()
-    for block in text.split("\n\n"):
-        bar_counts = set()
-        for line in block.splitlines():
-            if line.startswith("|"):
-                bars = re.findall(r"(?<!\\)\|", line)
-                bar_counts.add(len(bars))
-        assert len(bar_counts) <= 1, block
-
-
 @pytest.mark.parametrize("scenarios", [(0, 1, 2, 3, 4), ()])
 def test_without_matplotlib_or_files_there_are_no_pictures(
     tmp_path: Path,
@@ -278,44 +218,6 @@ def test_without_matplotlib_or_files_there_are_no_pictures(
     assert len(document["distribution"]) == len(scenarios)
 
 
-def test_a_copy_of_tolerant_identity_does_not_promise_equal_bits(
-    tmp_path: Path,
-) -> None:
-    """The sentence about equal bits depends on the manifest."""
-    size, manifest = make(tmp_path, scenarios=(0,))
-    exact = card(size, manifest)
-    assert "same bits" in exact
-    tolerant = card(size, manifest, identity="tolerance")
-    assert "same bits" not in tolerant
-
-
-@pytest.mark.parametrize(
-    ("split", "variables", "axes"),
-    [
-        ("cavity", {"velocity", "wall_velocity"}, "none"),
-        ("poiseuille", {"velocity", "body_force"}, "x, y"),
-        ("curl-noise-3d", set(), "x, y, z"),
-    ],
-)
-def test_a_card_lists_the_variables_of_its_files(
-    split: str, variables: set[str], axes: str
-) -> None:
-    """What drives the flow, and velocities where they are stored; one column of the
-    statistics for each axis.
-    """
-    size = registry.load().size(split, "tiny")
-    measured = size.measured
-    assert measured is not None
-    manifest = Manifest(split=split, size="tiny", version=size.version)
-    text = card(size, manifest, statistics=measured.statistics)
-    for name in ("velocity", "wall_velocity", "body_force"):
-        is_listed = f"| `{name}` |" in text
-        assert is_listed == (name in variables)
-    assert f"| periodic axes | {axes} |" in text
-    columns = " | ".join("xyz"[: size.dimension])
-    assert f"|  | {columns} |" in text
-
-
 def test_the_predictability_limit_is_the_mean_over_test(tmp_path: Path) -> None:
     """Two perturbed runs drift to 2e-3 and 4e-3, so the limit is 3e-3 at the end."""
     size, manifest = make(tmp_path, scenarios=(3, 4))
@@ -325,27 +227,6 @@ def test_the_predictability_limit_is_the_mean_over_test(tmp_path: Path) -> None:
         files.append(entry.model_copy(update={"twin_floor": limit}))
     text = card(size, manifest, files=tuple(files))
     assert "2e-06 at the first predicted frame, 0.003 at the last" in text
-
-
-@pytest.mark.parametrize(
-    "title",
-    [
-        "Fluß: größer",
-        "a\x7fb\x9f",
-        "a\u2028b\x85c",
-        "a\ufffeb",
-        'tab\t"\\',
-        "\U0001f30a",
-    ],
-)
-def test_the_head_of_a_card_is_yaml_with_any_title(title: str) -> None:
-    """YAML forbids some characters, and takes others for line breaks."""
-    size = registry.load().size("cavity", "tiny")
-    split = registry.load().split("cavity").model_copy(update={"title": title})
-    manifest = Manifest(split="cavity", size="tiny", version="1.0.0")
-    text = cards.dataset_card(size, split, manifest, pictures=[])
-    _, head, _ = text.split("---\n", 2)
-    assert yaml.safe_load(head)["pretty_name"] == f"{title} (cavity tiny)"
 
 
 def test_hostile_text_of_a_registry_stays_text() -> None:

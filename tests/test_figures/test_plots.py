@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from rotating_disc import OMEGA, write_swirl
 
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.data.registry import load
+from lagbench.errors import UsageError
 from lagbench.figures.canvas import ENDINGS, figure, save
 from lagbench.figures.colours import MATERIAL_COLOURS, parse_rgb
 from lagbench.figures.panels import (
@@ -119,6 +120,13 @@ def test_streamlines_of_a_periodic_box_reach_its_edges() -> None:
         assert points[:, axis].max() >= 1.0
 
 
+def sheet_of(split: str, root: Path) -> Path:
+    """Draw the sheet of a split's tiny data."""
+    registry = load()
+    size = registry.size(split, "tiny")
+    return contact_sheet(size, root, root / "s.png", registry=registry)
+
+
 @pytest.mark.slow
 def test_sheet_of_families_has_a_row_for_each(tmp_path: Path) -> None:
     """Scenarios of one family share a row, families lie below each other."""
@@ -132,7 +140,7 @@ def test_sheet_of_families_has_a_row_for_each(tmp_path: Path) -> None:
             walls=None,
             parameters={"family": family},
         )
-        sheet = contact_sheet("fluid", "tiny", tmp_path / "s.png", root=tmp_path)
+        sheet = sheet_of("fluid", tmp_path)
         height, _, _ = read_pixels(sheet).shape
         heights.append(height)
     one_circle, two_circles, with_splash = heights
@@ -150,7 +158,7 @@ def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
         materials=3,
         parameters={"pair": "made-up"},
     )
-    sheet = contact_sheet("multimaterial", "tiny", tmp_path / "s.png", root=tmp_path)
+    sheet = sheet_of("multimaterial", tmp_path)
     image = read_pixels(sheet)
     is_shown = []
     for colour in MATERIAL_COLOURS:
@@ -200,14 +208,6 @@ def test_what_cannot_be_drawn_is_refused(
 ) -> None:
     with pytest.raises(UsageError):
         plot(swirl, **settings)  # type: ignore[arg-type]
-
-
-def test_a_damaged_file_is_unreadable(swirl: Path, tmp_path: Path) -> None:
-    """A file that a user names is theirs, so it is no damage of a data set."""
-    damaged = tmp_path / "damaged.nc"
-    damaged.write_bytes(swirl.read_bytes()[:3000])
-    with pytest.raises(UnreadableFileError):
-        plot(damaged)
 
 
 def test_a_moving_wall_is_marked(swirl: Path) -> None:

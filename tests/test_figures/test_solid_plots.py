@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError
 from lagbench.figures.animate import draw_film
 from lagbench.figures.colours import MUTED
-from lagbench.figures.panels import Panel, draw, limit_of, place_of_slice
+from lagbench.figures.panels import Panel, draw, limit_of
 from lagbench.figures.plot import choose_moments, draw_scene
 from lagbench.figures.recording import Recording
-from lagbench.figures.solid import View
 
 FRAMES = 3
 BOTTOM = 0.125  # of the box of fluid-3d tiny
@@ -74,13 +73,6 @@ DROP = liquid(fill((0.4, 0.4, 0.4), (0.58, 0.58, 0.58)))
 def texts_of(drawn: Figure) -> list[str]:
     """Return the texts of a figure."""
     return [text.get_text() for text in drawn.findobj(Text) if text.get_text()]
-
-
-def test_a_liquid_is_shown_from_three_sides() -> None:
-    """Vorticity and streamlines of a splash say little: they come on request."""
-    words = texts_of(draw_scene(record(BLOCK).scene(2)))
-    for title in ("Particles by speed", "From the front", "From above"):
-        assert title in words
 
 
 @pytest.mark.parametrize("kind", [Panel.VORTICITY, Panel.STREAMLINES])
@@ -159,26 +151,3 @@ def test_a_view_shows_the_outline_of_an_obstacle(
     from_centre = draw_ball(kind, BALL) - centre
     assert len(from_centre) > 0
     np.testing.assert_allclose(np.linalg.norm(from_centre, axis=1), 0.1, rtol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [Panel.VORTICITY, Panel.STREAMLINES])
-def test_a_slice_shows_the_cut_of_an_obstacle(kind: Panel) -> None:
-    """A circle where the plane cuts it, and nothing where it passes by."""
-    assert len(draw_ball(kind, BALL)) == 0
-    cut = place_of_slice(record(BLOCK).scene(0))
-    met = BALL.assign_attrs(obstacle_z=cut + 0.06)
-    from_centre = draw_ball(kind, met) - [0.7, 0.4]
-    assert len(from_centre) > 0
-    np.testing.assert_allclose(np.linalg.norm(from_centre, axis=1), 0.08, rtol=1e-5)
-
-
-@pytest.mark.parametrize("kind", [Panel.SPEED, Panel.MATERIAL])
-def test_a_cube_holds_its_obstacle(kind: Panel) -> None:
-    """It stands where the view puts its centre, in the scale of the view."""
-    view = View(record(BALL).size.box)
-    from_centre = draw_ball(kind, BALL) - view.place(np.array([0.7, 0.4, 0.3]))
-    assert len(from_centre) > 0
-    np.testing.assert_allclose(
-        np.linalg.norm(from_centre, axis=1), 0.1 * view.scale, rtol=1e-5
-    )

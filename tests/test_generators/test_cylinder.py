@@ -149,7 +149,8 @@ def test_a_sheet_of_a_channel_is_low(
     The square around the channel would be wall for one half.
     """
     root = tiny_split("cylinder").root
-    path = contact_sheet("cylinder", "tiny", tmp_path / "sheet.png", root=root)
+    size = REGISTRY.size("cylinder", "tiny")
+    path = contact_sheet(size, root, tmp_path / "sheet.png", registry=REGISTRY)
     image = imread(path)
     wall_colour = to_rgb(WALL)
     is_wall = np.all(np.isclose(image[..., :3], wall_colour, atol=1e-3), axis=-1)

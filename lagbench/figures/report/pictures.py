@@ -30,7 +30,6 @@ from lagbench.figures.colours import (
     SERIES,
     WALL,
 )
-from lagbench.figures.numbers import format_quantity, sentence, words
 from lagbench.figures.solid import View
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.frame import Snapshot
@@ -91,11 +90,15 @@ def _draw_means(
 ) -> Picture:
     """Return the mean over scenarios of each row, with intervals of entries."""
     metric = rows[0].scores[name].metric
+    label = name.replace("_", " ")
+    unit = ""
+    if metric.unit != "1":
+        unit = f" [{metric.unit.replace('^2', '²')}]"
     note = f"Mean over {len(subject.scenarios)} scenarios"
     if len(subject.scenarios) >= FEWEST_FOR_INTERVAL:
         note += "; the bands are 95 % bootstrap intervals over scenarios"
     with figure(6.4, 3.4) as drawn:
-        axes = _curve_axes(drawn, format_quantity(metric))
+        axes = _curve_axes(drawn, f"{label}{unit}")
         true_score = rows[0].scores.get(f"{name}_true")
         if true_score is not None:
             values = mean_over_scenarios(true_score)
@@ -124,13 +127,18 @@ def _draw_means(
             axes.axhline(STABLE_PEARSON, color=MUTED, lw=0.8, ls=":")
             axes.set_ylim(top=1.0)
         else:
-            _choose_scale(axes)
+            # logarithmic where errors span more than a decade
+            curves = [np.asarray(line.get_ydata(), float) for line in axes.get_lines()]
+            joined = np.concatenate(curves)
+            positive = joined[np.isfinite(joined) & (joined > 0.0)]
+            if positive.size and positive.max() > 10.0 * positive.min():
+                axes.set_yscale("log")
         axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
         return Picture(
             name=f"methods-{name.replace('_', '-')}",
-            title=f"{words(name, capital=True)} over frames",
+            title=f"{label} over frames",
             thesis=thesis,
-            caption=f"{sentence(metric)} {note}.",
+            caption=f"{metric.summary}{unit} ({metric.source}). {note}.",
             image=encode(drawn),
         )
 
@@ -320,17 +328,6 @@ def _plot(
         lw=1.4,
         label=label,
     )
-
-
-def _choose_scale(axes: Axes) -> None:
-    """Make an axis of errors logarithmic where they span more than a decade."""
-    values = []
-    for line in axes.get_lines():
-        values.append(np.asarray(line.get_ydata(), np.float64))
-    joined = np.concatenate(values)
-    positive = joined[np.isfinite(joined) & (joined > 0.0)]
-    if positive.size and positive.max() > 10.0 * positive.min():
-        axes.set_yscale("log")
 
 
 @contextmanager

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -16,11 +15,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from lagbench.atomic import check_writable, write_atomically
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.figures.numbers import text, words
+from lagbench.figures.tables import Table
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.tables import brief_table, card_lines, card_tables
 
-from . import pictures, tables
-from .subject import Gallery, Subject, load_subject, read_gallery
+from . import pictures
+from .subject import Subject, load_subject, read_gallery
 
 FILE_NAME = "index.html"
 
@@ -29,30 +29,6 @@ POLICY = (
     "form-action 'none'"
 )
 """What a browser may do with the page; no other page has this text."""
-
-TILES = ("vorticity_pearson", "stable_frames", "spectrum_error", "position_rmse_20")
-"""Metrics at the top, after skill and the metric that ranks."""
-
-FLAG_STATES = {True: "raised", False: "clear", None: "unknown"}
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A number at the top of the page."""
-
-    title: str
-    value: str
-    note: str
-
-
-@dataclass(frozen=True)
-class Notice:
-    """A flag or a warning about an entry."""
-
-    entry: str
-    state: str  # raised, clear, unknown or warning
-    name: str
-    message: str
 
 
 def write_report(
@@ -124,69 +100,33 @@ def render(subject: Subject) -> str:
     particles = str(min(counts))
     if len(counts) > 1:
         particles = f"{min(counts)} to {max(counts)}"
+    if subject.is_full_box:
+        motion = ("The flow", list(pictures.flow_pictures(subject, gallery)))
+    else:
+        drawn = list(pictures.particle_pictures(subject, gallery))
+        motion = ("Particles", drawn + list(pictures.body_pictures(subject)))
+    brief_tables = []
+    all_tables: list[Table] = []
+    lines: list[str] = []
+    for entry in subject.entries:
+        brief_tables.append(brief_table(entry.card))
+        all_tables += card_tables(entry.card)
+        lines += (
+            f"{entry.name}: {line}" for line in card_lines(entry.card, every=True)
+        )
     return environment.get_template("page.html").render(
         policy=POLICY,
         subject=subject,
         header=header,
         config=subject.task.config,
         particles=particles,
-        tiles=_make_tiles(subject),
-        sections=_draw_sections(subject, gallery),
-        score_tables=tables.score_tables(subject),
-        metric_tables=tables.metric_tables(subject),
-        notices=_list_notices(subject),
+        sections=[
+            ("Error over the rollout", list(pictures.rollout_pictures(subject))),
+            motion,
+            ("Energy", list(pictures.energy_pictures(subject))),
+        ],
+        brief_tables=brief_tables,
+        all_tables=all_tables,
+        lines=lines,
         files=shlex.join(entry.predictions.name for entry in subject.entries),
     )
-
-
-def _draw_sections(
-    subject: Subject, gallery: Gallery
-) -> list[tuple[str, list[pictures.Picture]]]:
-    """Return the headings of the page's pictures, and the pictures."""
-    rollout = list(pictures.rollout_pictures(subject))
-    energy = list(pictures.energy_pictures(subject))
-    if subject.is_full_box:
-        motion = ("The flow", list(pictures.flow_pictures(subject, gallery)))
-    else:
-        particles = list(pictures.particle_pictures(subject, gallery))
-        motion = ("Particles", particles + list(pictures.body_pictures(subject)))
-    return [
-        ("Error over the rollout", rollout),
-        motion,
-        ("Energy", energy),
-    ]
-
-
-def _make_tiles(subject: Subject) -> list[Tile]:
-    """Return the numbers of the best entry that matter most."""
-    best = subject.best_entry
-    tiles = []
-    if best.entry is not None and best.entry.card.skill is not None:
-        skill = best.entry.card.skill
-        interval = tables.format_interval(skill.interval)
-        note = f"{interval}; 1 − score / score of {skill.reference}"
-        tiles.append(Tile("skill", text(skill.value), note))
-    for name in (subject.ranking.name, *TILES):
-        score = best.scores.get(name)
-        if score is None or any(tile.title == words(name) for tile in tiles):
-            continue
-        note = tables.format_interval(score.interval)
-        tiles.append(Tile(words(name), text(score.mean), note))
-    return tiles
-
-
-def _list_notices(subject: Subject) -> list[Notice]:
-    """Return flags and warnings of every entry."""
-    notices = []
-    for entry in subject.entries:
-        for flag in entry.card.flags:
-            reasons = "; ".join(flag.reasons)
-            state = FLAG_STATES[flag.raised]
-            name = flag.name.replace("_", " ")
-            notices.append(Notice(entry.name, state, name, reasons))
-        for warning in entry.card.warnings:
-            notices.append(Notice(entry.name, "warning", warning.check, str(warning)))
-        for scenario, frame in sorted((entry.card.header.diverged_at or {}).items()):
-            message = f"scenario {scenario} is frozen from frame {frame} on"
-            notices.append(Notice(entry.name, "warning", "diverged", message))
-    return notices

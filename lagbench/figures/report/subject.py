@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.box import WALL_NAMES
 from lagbench.data.layout import major_of
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.figures.recording import name_start
+from lagbench.figures.recording import describe_parameters
 from lagbench.figures.solid import SLICE
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
@@ -104,17 +103,6 @@ class Subject:
         return card.submission[card.ranking].metric
 
     @property
-    def best_entry(self) -> ReportRow:
-        """The entry with the least loss in the ranking metric, the first of equals."""
-        metric = self.ranking
-        rows = [row for row in self.rows if row.entry is not None]
-        losses = []
-        for row in rows:
-            score = row.scores[metric.name]
-            losses.append(metric.loss(score.mean))
-        return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
-
-    @property
     def data_name(self) -> str:
         """Split and size, and the subset if it is not test."""
         return self.entries[0].card.data_name
@@ -187,7 +175,17 @@ def load_subject(
         raise UsageError(
             "a report needs score cards and their predictions; give as many of both"
         )
-    _check_same_data(cards, predictions)
+    expected_fields: dict[str, object] = {}
+    for card, path in zip(cards, predictions, strict=True):
+        fields = {name: getattr(card.header, name) for name in SAME_FIELDS}
+        # The hash of a data set does not cover the subset shift.
+        fields["MAJOR version of the data"] = major_of(card.header.dataset_version)
+        for name, value in fields.items():
+            if value != expected_fields.setdefault(name, value):
+                raise UsageError(
+                    f"{path} has another {name} than the files before it; report "
+                    "submissions to one data set together"
+                )
     header = cards[0].header
     folder = resolve_root(root)
     splits = load_rooted_registry(folder, registry)
@@ -207,22 +205,6 @@ def load_subject(
         entries.append(entry)
     title = splits.split(header.split).title
     return Subject(task=task, title=title, entries=tuple(entries))
-
-
-def _check_same_data(cards: Sequence[ScoreCard], predictions: Sequence[Path]) -> None:
-    """Refuse score reports that are about different data."""
-    expected_fields: dict[str, object] = {}
-    for card, path in zip(cards, predictions, strict=True):
-        fields = {name: getattr(card.header, name) for name in SAME_FIELDS}
-        # The hash of a data set does not cover the subset shift.
-        fields["MAJOR version of the data"] = major_of(card.header.dataset_version)
-        for name, value in fields.items():
-            expected = expected_fields.setdefault(name, value)
-            if value != expected:
-                raise UsageError(
-                    f"{path} has another {name} than the files before it; report "
-                    "submissions to one data set together"
-                )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -300,7 +282,10 @@ def read_gallery(subject: Subject) -> Gallery:
             else:
                 frames = sorted(all_frames)
             with subject.task.opened(number) as truth:
-                labels[number] = _label_scenario(truth)
+                details = describe_parameters(truth.file.header.parameters)
+                if truth.scenario.config.box.dimension == 3:
+                    details.append(f"fields are a slice {SLICE}")
+                labels[number] = ", ".join(details)
                 for frame in frames:
                     pairs = _read_pairs(truth, files, number, frame)
                     moment = Moment(scenario=number, frame=frame, pairs=pairs)
@@ -328,31 +313,6 @@ def _read_pairs(
         )
         pairs.append(FramePair(scenario, frame, true_snapshot, predicted_snapshot))
     return tuple(pairs)
-
-
-def _label_scenario(truth: OpenScenario) -> str:
-    """Return the family, the Reynolds number and the moving walls of a scenario."""
-    file = truth.file
-    parameters = file.header.parameters
-    details = []
-    for name in ("family", "pair"):
-        if name in parameters:
-            details.append(str(parameters[name]))
-    start = name_start(parameters)
-    if start:
-        details.append(start)
-    reynolds = parameters.get("reynolds_number")
-    if isinstance(reynolds, (int, float)):
-        details.append(f"Re {reynolds:.0f}")
-    if "wall_velocity" in file.variables:
-        wall_velocity = np.asarray(file.read("wall_velocity"), np.float64)
-        largest = np.abs(wall_velocity).max(axis=0)  # shape [wall, axis]
-        for number, velocity in enumerate(largest):
-            if np.delete(velocity, number // 2).any():
-                details.append(f"{WALL_NAMES[number]} wall moves")
-    if truth.scenario.config.box.dimension == 3:
-        details.append(f"fields are a slice {SLICE}")
-    return ", ".join(details)
 
 
 def limit_of(fields: Sequence[Floats]) -> float:
