@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lagbench.atomic import write_atomically
+from lagbench.atomic import check_output_file, write_atomically
 from lagbench.data.layout import expand_home
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.store.copy import scenario_files
-from lagbench.submission.writer import PredictionsWriter, check_predictions_output
+from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.run import Meter, Progress
 
 from .augmentation import check_symmetry
@@ -132,7 +132,7 @@ def predict(
     where = str(checkpoint_path)
     trained = load(checkpoint_path)
     output_path = expand_home(output, "--output")
-    check_predictions_output(output_path, overwrite=overwrite)
+    check_output_file(output_path, overwrite=overwrite)
     root_folder = resolve_root(root)
     if split is not None:
         location = locate_split(split, root=root, registry=registry)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.atomic import check_output_file
 from lagbench.data.layout import expand_home
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
@@ -13,7 +14,6 @@ from lagbench.errors import UsageError
 from lagbench.store.copy import scenario_files
 from lagbench.submission.writer import (
     PredictionsWriter,
-    check_predictions_output,
 )
 from lagbench.work.machine import processor_name
 from lagbench.work.run import Meter, Progress
@@ -80,7 +80,7 @@ def predict_onnx(
     """
     model_path = expand_home(model, "model")
     output_path = expand_home(output, "--output")
-    check_predictions_output(output_path, overwrite=overwrite)
+    check_output_file(output_path, overwrite=overwrite)
     declared = check_onnx(model_path)
     if split is None:
         split = declared.split

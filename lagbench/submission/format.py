@@ -24,11 +24,9 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from lagbench.data.box import AXES
 from lagbench.data.hdf5 import (
     MAX_LINKS,
     hdf5_errors,
-    is_text,
     list_members,
     open_variable,
 )
@@ -87,10 +85,6 @@ ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
     "position": {
         "long_name": "predicted particle position in lengths of the unit box",
         "units": "1",
-    },
-    "velocity": {
-        "long_name": "predicted particle velocity in box lengths per second",
-        "units": "s-1",
     },
     "diverged_at": {
         "long_name": "first frame of a frozen rollout, -1 where none is",
@@ -188,7 +182,6 @@ class FileInfo:
     arrays: Mapping[str, ArrayInfo]  # variables of the format that a hard link leads to
     packing: Mapping[str, object]  # scale_factor and add_offset of ``position``
     integers: Mapping[str, tuple[int, ...]]  # coordinates whose values could be read
-    components: tuple[str, ...]  # names of the components of a position, if any
     length: int  # length of the file [bytes]
 
     @property
@@ -270,7 +263,7 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
     arrays = {}
     integers = {}
     packing = {}
-    for name in ("position", "particle", *INTEGERS):
+    for name in ("position", *INTEGERS):
         if links.get(name) != "variable":
             continue
         with hdf5_errors(path, name):
@@ -283,14 +276,7 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
                         packing[attribute] = value
             elif is_coordinate_readable(array):
                 integers[name] = tuple(int(value) for value in dataset[...])
-            if name != "particle":  # without values netCDF keeps a float in its place
-                arrays[name] = array
-    components: tuple[str, ...] = ()
-    if links.get("space") == "variable":
-        with hdf5_errors(path, "space"):
-            space = open_variable(file, "space")
-            if is_text(space) and space.shape in [(count,) for count in SPACES]:
-                components = tuple(str(name) for name in space.asstr()[...])
+            arrays[name] = array
     return FileInfo(
         links=links,
         link_count=link_count,
@@ -298,7 +284,6 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
         arrays=arrays,
         packing=packing,
         integers=integers,
-        components=components,
         length=length,
     )
 
@@ -392,7 +377,29 @@ def check_layout(
             where=where,
         )
     _check_dims(info, position, issues, dimension=dimension)
-    _check_diverged_at(info, issues)
+    marks = info.arrays.get("diverged_at")
+    frozen_from = info.integers.get("diverged_at")
+    frames = info.integers.get("frame")
+    if marks is not None and (frozen_from is None or frames is None):
+        issues.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
+    elif marks is not None and frozen_from is not None and frames is not None:
+        where = "variable 'diverged_at'"
+        scenario_count = len(info.integers.get("scenario", ()))
+        if marks.dims != ("scenario",) or len(frozen_from) != scenario_count:
+            issues.error(
+                "diverged_at",
+                "not one value per scenario, on the dimension 'scenario'; store it so, "
+                "or leave it out",
+                where=where,
+            )
+        wrong_frames = sorted(set(frozen_from) - {NEVER, *frames})
+        if wrong_frames:
+            issues.error(
+                "diverged_at",
+                f"{quote(wrong_frames)}: no predicted frames; name the first frozen "
+                f"frame, or {NEVER} for a rollout that did not diverge",
+                where=where,
+            )
     has_dims = "dims" not in issues.skipped
     return is_stored and has_dims and not issues.first_failed("dims", "dtype")
 
@@ -430,15 +437,6 @@ def _check_dims(
     if shape != lengths:
         issues.error("dims", f"shape {shape}, not {lengths}; {WRITE}", where=where)
         return
-    particles = info.integers.get("particle", ())
-    has_order = list(particles) == list(range(len(particles)))
-    if info.components not in ((), AXES[:dimension]) or not has_order:
-        issues.error(
-            "dims",
-            "components or particles stand in another order; store x, y, z, and "
-            "particles 0, 1, 2 and so on in the order of the given frames",
-            where=where,
-        )
     counted = info.arrays.get("particle_count")
     if counted is None:
         return
@@ -450,33 +448,4 @@ def _check_dims(
             f"not one number from 1 to {shape[2]} per scenario; leave it out where all "
             "scenarios have as many particles",
             where="variable 'particle_count'",
-        )
-
-
-def _check_diverged_at(info: FileInfo, issues: IssueCollector) -> None:
-    """Check that ``diverged_at``, if any, has a predicted frame or -1 per scenario."""
-    array = info.arrays.get("diverged_at")
-    if array is None:
-        return
-    frozen_from = info.integers.get("diverged_at")
-    frames = info.integers.get("frame")
-    if frozen_from is None or frames is None:
-        issues.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
-        return
-    where = "variable 'diverged_at'"
-    scenario_count = len(info.integers.get("scenario", ()))
-    if array.dims != ("scenario",) or len(frozen_from) != scenario_count:
-        issues.error(
-            "diverged_at",
-            "not one value per scenario, on the dimension 'scenario'; store it so, or "
-            "leave it out",
-            where=where,
-        )
-    wrong_frames = sorted(set(frozen_from) - {NEVER, *frames})
-    if wrong_frames:
-        issues.error(
-            "diverged_at",
-            f"{quote(wrong_frames)}: no predicted frames; name the first frozen frame, "
-            f"or {NEVER} for a rollout that did not diverge",
-            where=where,
         )

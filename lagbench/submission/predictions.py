@@ -154,17 +154,12 @@ class Predictions:
         return hasher
 
 
-def open_predictions(path: str | Path, *, info: FileInfo | None = None) -> Predictions:
+def open_predictions(path: str | Path) -> Predictions:
     """Open a predictions.nc without trusting it.
 
     Only the layout of the file is checked here, not its agreement with a data set: that
     is `lagbench.validate`, which also guards against files that make HDF5 loop or
     crash.
-
-    Args:
-        path: the file.
-        info: the `FileInfo` of this file from an earlier opening, if there is one. The
-            layout of a file of the same length is then not checked again.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.
@@ -173,11 +168,10 @@ def open_predictions(path: str | Path, *, info: FileInfo | None = None) -> Predi
     path = expand_home(path, "path")
     with ExitStack() as stack:
         file = stack.enter_context(open_hdf5(path, fix=WRITE))
-        if info is None or info.length != path.stat().st_size:
-            info = inspect_file(file, path)
-            issues = IssueCollector()
-            check_layout(info, issues)
-            issues.result(path).check()
+        info = inspect_file(file, path)
+        issues = IssueCollector()
+        check_layout(info, issues)
+        issues.result(path).check()
         return attach(file, path, info, stack)
 
 

@@ -7,9 +7,9 @@ leaderboard have the sentence alone.
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 MOST_OVERRIDES = 200
 """Most changed options of one training or prediction."""
@@ -49,14 +49,6 @@ class TrainingProvenance(_Strict):
     prediction_overrides: Overrides = Field(
         default=(), description="options that the prediction changed"
     )
-
-    @classmethod
-    def from_json(cls, text: str) -> Self | None:
-        """Return the provenance that a text holds as JSON; None where it holds none."""
-        try:
-            return cls.model_validate_json(text)
-        except ValidationError:
-            return None
 
     def to_json(self) -> str:
         """Return the provenance as compact JSON; defaults are left out."""

@@ -122,7 +122,22 @@ def validate(
                 value = info.attributes.get(name)
                 if isinstance(value, str):
                     names[name] = value
-            size = _find_size(info, splits, issues)
+            size = None
+            subset = str(info.attributes.get("subset", "test"))
+            if {"split", "size"} <= names.keys():
+                try:
+                    tier = splits.size(names["split"], names["size"])
+                    size = tier.scored_on(subset)
+                except (UsageError, UnreadableFileError) as error:
+                    issues.error(
+                        "split",
+                        f"{error.text[:MAX_NAME]}; name a split of your own by "
+                        "--split own/",
+                        where=f"split {quote(names['split'])}, size "
+                        f"{quote(names['size'])}, subset {quote(subset)}",
+                    )
+            else:
+                issues.skip("the file does not name its split and size", "split")
             dimension = None if size is None else size.dimension
             is_readable = check_layout(info, issues, dimension=dimension)
             if size is None:
@@ -164,27 +179,6 @@ def require_split(result: ValidationResult, expected_split: str | None) -> None:
         f"{result.path} holds predictions for {result.split!a}, not for "
         f"{expected_split}; {suggest_split_of(result.split)}"
     )
-
-
-def _find_size(
-    info: FileInfo, registry: Registry, issues: IssueCollector
-) -> Size | None:
-    """Return the split, size and subset that a file names; None if there is none."""
-    split = info.attributes.get("split")
-    size = info.attributes.get("size")
-    subset = info.attributes.get("subset", "test")
-    if not isinstance(split, str) or not isinstance(size, str):
-        issues.skip("the file does not name its split and size", "split")
-        return None
-    try:
-        return registry.size(split, size).scored_on(str(subset))
-    except (UsageError, UnreadableFileError) as error:
-        issues.error(
-            "split",
-            f"{error.text[:MAX_NAME]}; name a split of your own by --split own/",
-            where=f"split {quote(split)}, size {quote(size)}, subset {quote(subset)}",
-        )
-        return None
 
 
 def _check_task(info: FileInfo, size: Size, root: Path, issues: IssueCollector) -> bool:

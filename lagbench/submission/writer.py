@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -29,9 +28,6 @@ from .truth import Truth, dataset_hash_of, frames_to_predict, max_test_particles
 CHUNK_CACHE_BYTES = 1 << 20
 """Memory for the chunks of a variable while it is written [bytes]."""
 
-ADDRESS_SCHEME = re.compile("[A-Za-z][A-Za-z0-9+.-]+:")
-"""First part of the path of an address, such as s3://bucket/p.nc."""
-
 Label = str | int | float
 """Value of an optional attribute."""
 
@@ -49,7 +45,6 @@ class PredictionsWriter:
             have data.
         method: what makes the predictions.
         subset: the subset that is predicted: test, or shift, which lies outside train.
-        velocity: whether velocities are stored too (they are not scored).
         dataset_sha256: hash of the data set that the model was given; else the recorded
             one.
         root: folder of all data sets; read where no size is named, where the split is a
@@ -59,8 +54,7 @@ class PredictionsWriter:
         **labels: see :meth:`label`.
 
     Raises:
-        UsageError: unknown split, size or label, or the path is that of a folder or an
-            address of a store.
+        UsageError: unknown split, size or label, or the path is that of a folder.
         DataError: the hash of the data set is not known.
     """
 
@@ -72,7 +66,6 @@ class PredictionsWriter:
         size: str | None = None,
         method: str,
         subset: str = "test",
-        velocity: bool = False,
         dataset_sha256: str | None = None,
         root: str | Path | None = None,
         registry: Registry | None = None,
@@ -81,7 +74,7 @@ class PredictionsWriter:
     ) -> None:
         self.path = expand_home(path, option)
         self._option = option
-        check_predictions_output(self.path, overwrite=True, option=option)
+        check_output_file(self.path, overwrite=True, option=option)
         tier, folder, _ = locate(split, size, root=root, registry=registry)
         self.size = tier.scored_on(subset)
         if dataset_sha256 is None:
@@ -102,7 +95,6 @@ class PredictionsWriter:
                 where="dataset_sha256",
             )
         self._dataset_sha256 = dataset_sha256
-        self._variables = ("position", "velocity") if velocity else ("position",)
         self._row_of: dict[int, int] = {}
         for row, scenario in enumerate(sorted(self.size.scored_scenarios)):
             self._row_of[scenario] = row
@@ -155,40 +147,47 @@ class PredictionsWriter:
             with self._writing():
                 self._file = open_netcdf(temporary, "w")
                 stack.callback(self._abandon)
-                self._write_headers()
+                lengths = (len(self._row_of), *self._stored_shape)
+                for name, length in zip(DIMS, lengths, strict=True):
+                    self._file.createDimension(name, length)
+                numbers = list(self._row_of)
+                self._create_coordinate("scenario", "scenario", numbers)
+                self._create_coordinate("frame", "frame", frames_to_predict(self.size))
+                counts = [self.size.particle_count(number) for number in numbers]
+                if len(set(counts)) > 1:
+                    self._create_coordinate("particle_count", "scenario", counts)
+                # Not packed: zlib saves little of digits that hardly repeat, and
+                # unpacking makes scoring slower. Frames are written once, in order: a
+                # cache of a MiB does.
+                variable = self._file.createVariable(
+                    "position",
+                    "f4",
+                    DIMS,
+                    endian="little",
+                    fill_value=False,
+                    fletcher32=True,
+                    chunksizes=(1, 1, *self._stored_shape[1:]),
+                    chunk_cache=CHUNK_CACHE_BYTES,
+                )
+                variable.setncatts(ATTRIBUTES["position"])
+                self._file.setncatts(
+                    {
+                        "Conventions": "CF-1.11",
+                        "lagbench_format": np.int32(FORMAT),
+                        "split": self.size.split,
+                        "size": self.size.name,
+                        "dataset_version": self.size.version,
+                        "dataset_sha256": self._dataset_sha256,
+                    }
+                )
             self._stack = stack.pop_all()
         self._is_open = True
         return self
-
-    def _write_headers(self) -> None:
-        """Create dimensions, coordinates, empty variables and required attributes."""
-        lengths = (len(self._row_of), *self._stored_shape)
-        for name, length in zip(DIMS, lengths, strict=True):
-            self._file.createDimension(name, length)
-
-        self._create_coordinate("scenario", "scenario", list(self._row_of))
-        self._create_coordinate("frame", "frame", frames_to_predict(self.size))
-        particle_counts = [self.size.particle_count(number) for number in self._row_of]
-        if len(set(particle_counts)) > 1:
-            self._create_coordinate("particle_count", "scenario", particle_counts)
-        for name in self._variables:
-            self._create_variable(name)
-        self._file.setncatts(
-            {
-                "Conventions": "CF-1.11",
-                "lagbench_format": np.int32(FORMAT),
-                "split": self.size.split,
-                "size": self.size.name,
-                "dataset_version": self.size.version,
-                "dataset_sha256": self._dataset_sha256,
-            }
-        )
 
     def add(
         self,
         scenario: int,
         position: ArrayLike,
-        velocity: ArrayLike | None = None,
         *,
         diverged_at: int | None = None,
     ) -> None:
@@ -199,7 +198,6 @@ class PredictionsWriter:
                 dimensions.
             position: positions [length] at the frames to predict, shape [frame,
                 particle, space].
-            velocity: velocities [length/s], same shape.
             diverged_at: absolute frame from which a diverging rollout is frozen.
 
         Raises:
@@ -223,18 +221,7 @@ class PredictionsWriter:
         where = f"scenario {number}"
         if number in self._written:
             raise UsageError("a scenario is written once", where=where)
-        arrays = {"position": position}
-        if velocity is not None:
-            arrays["velocity"] = velocity
-        if len(arrays) != len(self._variables):
-            raise UsageError(
-                "velocities come for every scenario, with velocity=True, or for none",
-                where=where,
-            )
-        values = {}
-        for name, array in arrays.items():
-            values[name] = self._check_values(name, number, array)
-
+        values = self._check_values(number, position)
         if diverged_at is not None:
             frames = frames_to_predict(self.size)
             where = f"diverged_at of {where}"
@@ -245,7 +232,7 @@ class PredictionsWriter:
                     f"number of the first frozen frame: {format_ids(frames)}",
                     where=where,
                 )
-            frozen = values["position"][frames.index(diverged_at) :]
+            frozen = values[frames.index(diverged_at) :]
             if (frozen != frozen[:1]).any():
                 raise UsageError(
                     f"the rollout moves after frame {diverged_at}; freeze it at its "
@@ -255,11 +242,10 @@ class PredictionsWriter:
 
         row = self._row_of[number]
         with self._writing():
-            for name, array in values.items():
-                # Particles that the scenario does not have are padding.
-                padded = np.full(self._stored_shape, np.nan, np.float32)
-                padded[:, : array.shape[1]] = array
-                self._file[name][row] = padded
+            # Particles that the scenario does not have are padding.
+            padded = np.full(self._stored_shape, np.nan, np.float32)
+            padded[:, : values.shape[1]] = values
+            self._file["position"][row] = padded
         if diverged_at is not None:
             self._diverged_at[row] = diverged_at
         self._written.add(number)
@@ -299,11 +285,9 @@ class PredictionsWriter:
             with suppress(OSError, RuntimeError):
                 self._file.close()
 
-    def _check_values(
-        self, name: str, scenario: int, values: ArrayLike
-    ) -> NDArray[np.float32]:
+    def _check_values(self, scenario: int, values: ArrayLike) -> NDArray[np.float32]:
         """Return values as float32; refuse a wrong type, shape or values not finite."""
-        where = f"{name} of scenario {scenario}"
+        where = f"position of scenario {scenario}"
         numbers = _numbers_of(values, where)
         with np.errstate(over="ignore"):
             array = numbers.astype(np.float32)
@@ -332,22 +316,6 @@ class PredictionsWriter:
         )
         variable.setncatts(ATTRIBUTES[name])
         variable[:] = np.array(values, np.int32)
-
-    def _create_variable(self, name: str) -> None:
-        # Not packed: zlib saves little of digits that hardly repeat, and unpacking
-        # makes scoring slower. Frames are written once, in order: a cache of a MiB
-        # does.
-        variable = self._file.createVariable(
-            name,
-            "f4",
-            DIMS,
-            endian="little",
-            fill_value=False,
-            fletcher32=True,
-            chunksizes=(1, 1, *self._stored_shape[1:]),
-            chunk_cache=CHUNK_CACHE_BYTES,
-        )
-        variable.setncatts(ATTRIBUTES[name])
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -380,7 +348,6 @@ def write(
     size: str | None = None,
     method: str,
     subset: str = "test",
-    velocities: Mapping[int, ArrayLike] | ArrayLike | None = None,
     diverged_at: Mapping[int, int] | None = None,
     dataset_sha256: str | None = None,
     root: str | Path | None = None,
@@ -400,7 +367,6 @@ def write(
             have data.
         method: what made the predictions.
         subset: the subset that is predicted: test, or shift, which lies outside train.
-        velocities: velocities [length/s], in the same form; stored, not scored.
         diverged_at: scenario id to the absolute frame from which its rollout is frozen.
         dataset_sha256: hash of the data set that the model was given; else the recorded
             one.
@@ -414,7 +380,7 @@ def write(
 
     Raises:
         UsageError: unknown names or scenarios, wrong shapes, missing scenarios, values
-            that are not finite, or the path is that of a folder or an address.
+            that are not finite, or the path is that of a folder.
         DataError: the hash of the data set is not known.
         WorkFailedError: the disk is full or not writable.
     """
@@ -424,7 +390,6 @@ def write(
         size=size,
         method=method,
         subset=subset,
-        velocity=velocities is not None,
         dataset_sha256=dataset_sha256,
         root=root,
         registry=registry,
@@ -433,22 +398,19 @@ def write(
     )
     scenarios = sorted(writer.size.scored_scenarios)
     position_of = _by_scenario(positions, scenarios)
-    velocity_of = {} if velocities is None else _by_scenario(velocities, scenarios)
     frozen_from = diverged_at or {}
-    for name, known in (("velocities", velocity_of), ("diverged_at", frozen_from)):
-        unknown = [scenario for scenario in known if scenario not in scenarios]
-        if unknown:
-            raise UsageError(
-                f"no test scenarios: {quote(unknown)}; give ids, not rows: "
-                f"{format_ids(scenarios)}",
-                where=name,
-            )
+    unknown = [scenario for scenario in frozen_from if scenario not in scenarios]
+    if unknown:
+        raise UsageError(
+            f"no test scenarios: {quote(unknown)}; give ids, not rows: "
+            f"{format_ids(scenarios)}",
+            where="diverged_at",
+        )
     with writer:
         for scenario, position in position_of.items():
             writer.add(
                 scenario,
                 position,
-                velocity_of.get(scenario),
                 diverged_at=frozen_from.get(scenario),
             )
     return writer.path
@@ -460,12 +422,12 @@ def _by_scenario(
     """Return values by scenario id; an array holds scenarios by ascending id."""
     if isinstance(values, Mapping):
         return values
-    array = _numbers_of(values, "positions or velocities")
+    array = _numbers_of(values, "positions")
     if array.ndim != len(DIMS) or len(array) != len(scenarios):
         raise UsageError(
             f"shape {array.shape}; give all {len(scenarios)} test scenarios in one "
             "array of 4 dimensions, or a mapping of id to array",
-            where="positions or velocities",
+            where="positions",
         )
     return dict(zip(scenarios, array, strict=True))
 
@@ -484,28 +446,6 @@ class TemplateResult:
     # least and greatest number of particles of a predicted scenario
     particle_range: tuple[int, int]
     bytes: int
-
-
-def check_predictions_output(
-    output: Path, *, overwrite: bool, option: str = "--output"
-) -> None:
-    """Refuse, before the work, a file that predictions must not be written to.
-
-    Args:
-        output: the file.
-        overwrite: whether the user allows to replace predictions of that name.
-        option: the option or argument that names it, for messages.
-
-    Raises:
-        UsageError: it is an address, whose name a local folder would get, a folder, or
-            there are such predictions.
-    """
-    if len(output.parts) > 1 and ADDRESS_SCHEME.fullmatch(output.parts[0]):
-        raise UsageError(
-            f"{output} is an address; write {output.name}, then copy it there",
-            where=option,
-        )
-    check_output_file(output, overwrite=overwrite, option=option)
 
 
 def template(
@@ -539,7 +479,7 @@ def template(
     any_size, folder, splits = locate(split, size, root=root, registry=registry)
     entry = any_size.scored_on(subset)
     output_path = expand_home(output, "--output")
-    check_predictions_output(output_path, overwrite=overwrite)
+    check_output_file(output_path, overwrite=overwrite)
     update_working_copy(entry, folder, entry.subsets[subset])
     truth = Truth(entry, folder)
     truth.require()

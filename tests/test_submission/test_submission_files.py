@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tracemalloc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,6 @@ from lagbench.submission import (
     PredictionsWriter,
     open_predictions,
     template,
-    validate,
     write,
 )
 
@@ -142,45 +141,6 @@ def test_the_template_is_the_last_given_frame_repeated(
     assert not output.exists()
 
 
-def test_predictions_may_be_written_to_the_home_folder(
-    bench: Bench, home_folder: Path
-) -> None:
-    """As pictures and exports."""
-    location: dict[str, Any] = {
-        "root": bench.root,
-        "registry": bench.registry,
-    }
-    result = template("cavity", "tiny", output="~/t.nc", **location)
-    assert result.path == home_folder / "t.nc"
-    assert bench.validate(result.path).exit_code == 0
-    assert validate("~/t.nc", **location).valid
-    positions = {}
-    with open_predictions("~/t.nc") as predictions:
-        for scenario in TESTS:
-            positions[scenario] = predictions.frames(scenario, GIVEN, HORIZON)
-    written = write(
-        "~/w.nc", positions, split="cavity", size="tiny", method="dot", **location
-    )
-    assert written == home_folder / "w.nc"
-    assert bench.validate(written).exit_code == 0
-
-
-def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
-    bench: Bench, tmp_path: Path
-) -> None:
-    """The error about the file would only follow after a correct name."""
-    output = tmp_path / "predictions.nc"
-    output.write_bytes(b"mine")
-    location: dict[str, Any] = {"root": bench.root, "registry": bench.registry}
-    with pytest.raises(UsageError, match="cavitty"):
-        template("cavitty", output=output, **location)
-    with pytest.raises(UsageError) as caught:
-        template("cavity", "tiny", output=output, **location)
-    assert caught.value.where == "--output"
-    assert str(output) in str(caught.value)
-    assert output.read_bytes() == b"mine"
-
-
 def test_without_a_recorded_hash_one_must_be_given(
     unmeasured: Registry, tmp_path: Path
 ) -> None:
@@ -253,28 +213,15 @@ WRONG_VALUES: list[tuple[Values, str]] = [
 WRONG_LABELS: list[tuple[Labels, str]] = [
     ({"sed": 3}, "sed"),
     ({"seed": "three"}, "'seed'"),
-    ({"seed": 2**70}, "'seed'"),
-    ({"parameters": -5}, "'parameters'"),
-    ({"seconds_per_frame": 10**400}, "'seconds_per_frame'"),
     ({"seconds_per_frame": -1}, "'seconds_per_frame'"),
-    ({"seconds_per_frame": float("inf")}, "'seconds_per_frame'"),
-    ({"device": "\udcff"}, "'device'"),
     ({"device": "a\0b"}, "'device'"),
-    ({"training": "x" * 70_000}, "'training'"),
-    ({"method": " "}, "'method'"),
     ({"method": "a\x07"}, "'method'"),
-    ({"method": "x" * 201}, "'method'"),
-    ({"method": None}, "method"),
     ({"dataset_sha256": "zz"}, "dataset_sha256"),
-    ({"dataset_sha256": 5}, "dataset_sha256"),
 ]
 
 WRONG_COMPANIONS: list[tuple[Labels, str]] = [
     # rows instead of ids
     ({"diverged_at": {0: 10}}, "diverged_at"),
-    ({"velocities": RIGHT | {0: RIGHT[3]}}, "velocities"),
-    # velocities of some scenarios only
-    ({"velocities": {3: RIGHT[3]}}, "scenario 4"),
     # a mark before motion that goes on, beyond the horizon, or in the given frames
     ({"diverged_at": {4: 7}}, "diverged_at of scenario 4"),
     ({"diverged_at": {4: 100_000}}, "diverged_at of scenario 4"),
@@ -303,55 +250,16 @@ def test_what_does_not_fit_is_refused(
     assert sorted(bench.folder.iterdir()) == before
 
 
-def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
-    """Velocities are not read by the scorer but are there for others; diverged_at comes
-    back by id.
-    """
+def test_frozen_rollouts_are_recorded_by_id(bench: Bench) -> None:
     values = RIGHT | {5: frozen(truth(5), 7)}
-    velocities = {scenario: -positions for scenario, positions in values.items()}
-    more = options(bench, velocities=velocities, diverged_at={5: 7})
+    more = options(bench, diverged_at={5: 7})
     path = write(bench.folder / "v.nc", values, **more)
-    with h5py.File(path) as file:
-        velocity = file["velocity"][...]
-        position = file["position"][...]
-    assert_array_equal(velocity, -position)
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
     with pytest.raises(WorkFailedError) as caught:
         write(bench.valid / "p.nc", RIGHT, **options(bench))
     assert caught.value.where.endswith("valid.nc/p.nc")
-
-
-@pytest.mark.parametrize("path", ["", ".", "/", "folder"])
-def test_predictions_are_not_written_to_a_folder(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str
-) -> None:
-    """Neither an empty path nor that of a folder names a file."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(UsageError) as caught:
-        write(path, RIGHT, **options(bench))
-    assert caught.value.where == "path"
-
-
-@pytest.mark.parametrize("kind", [str, Path])
-def test_predictions_are_not_written_to_an_address(
-    bench: Bench,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    kind: Callable[[str], Any],
-) -> None:
-    """No local folder gets the name of the scheme."""
-    monkeypatch.chdir(tmp_path)
-    address = kind("s3://bucket/x.nc")
-    with pytest.raises(UsageError) as caught:
-        write(address, RIGHT, **options(bench))
-    assert caught.value.where == "path"
-    with pytest.raises(UsageError) as caught:
-        template("cavity", "tiny", output=address, registry=bench.registry)
-    assert caught.value.where == "--output"
-    assert not list(tmp_path.iterdir())
 
 
 def test_labels_may_come_while_writing(bench: Bench) -> None:
@@ -376,25 +284,6 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
         assert header.device == "one core"
 
 
-def test_ids_may_be_those_of_xarray(bench: Bench) -> None:
-    path = bench.folder / "ids.nc"
-    ids = xr.DataArray(list(TESTS), dims="scenario")
-    with PredictionsWriter(path, **options(bench)) as writer:
-        for scenario in ids:
-            writer.add(scenario, truth(int(scenario)))
-    assert bench.validate(path).valid
-
-
-@pytest.mark.parametrize("scenario", [[3], np.array([3]), "3", 3.5, None, RAGGED, True])
-def test_ids_that_are_no_whole_numbers_are_refused(bench: Bench, scenario: Any) -> None:
-    with (
-        pytest.raises(UsageError) as caught,
-        PredictionsWriter(bench.folder / "refused.nc", **options(bench)) as writer,
-    ):
-        writer.add(scenario, FIRST)
-    assert str(caught.value.where).startswith("scenario ")
-
-
 def test_an_error_of_the_caller_goes_on_as_it_is(bench: Bench) -> None:
     """A pipe that broke is no disk that is full."""
     path = bench.folder / "broken.nc"
@@ -404,33 +293,6 @@ def test_an_error_of_the_caller_goes_on_as_it_is(bench: Bench) -> None:
     ):
         raise BrokenPipeError
     assert not path.exists()
-
-
-def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
-    """Values of an earlier try do not count as written; without an open file no value
-    is accepted.
-    """
-    path = bench.folder / "again.nc"
-    writer = PredictionsWriter(path, **options(bench))
-    with pytest.raises(UsageError):
-        writer.add(3, truth(3))
-
-    def attempt(scenarios: Sequence[int], then: object = None) -> None:
-        with writer:
-            for scenario in scenarios:
-                writer.add(scenario, truth(scenario))
-            if then is not None:
-                raise KeyError(then)
-
-    with pytest.raises(KeyError):
-        attempt(TESTS[:1], then="a crash")
-    with pytest.raises(UsageError):
-        attempt(TESTS[1:])
-    assert not path.exists()
-    attempt(TESTS)
-    with pytest.raises(UsageError):
-        attempt(())
-    assert bench.validate(path).valid
 
 
 ALL = list(range(GIVEN, FRAMES))
@@ -482,26 +344,13 @@ def test_scenarios_in_another_order_are_matched_by_id(bench: Bench) -> None:
         assert shuffled.content_sha256() == plain.content_sha256()
 
 
-ONE_FRAME = (1, 1, PARTICLES, 2)
 PACKINGS: dict[str, dict[str, Any]] = {
     "contiguous": {},
     "big_endian": {"dtype": ">f4"},
-    "one_chunk": {
-        "chunks": (3, 8, PARTICLES, 2),
-        "compression": 9,
-    },
     "chunks_over_scenarios": {
         "chunks": (2, 3, 7, 1),
         "compression": 1,
         "shuffle": True,
-    },
-    "checksummed": {
-        "chunks": ONE_FRAME,
-        "fletcher32": True,
-    },
-    "unlimited": {
-        "chunks": ONE_FRAME,
-        "maxshape": (None, None, PARTICLES, 2),
     },
 }
 
@@ -607,7 +456,7 @@ LAYOUTS = (
 )
 
 
-@pytest.mark.parametrize("name", ["fifo", "truncated_half", "netcdf3", *LAYOUTS])
+@pytest.mark.parametrize("name", ["truncated_half", "netcdf3", *LAYOUTS])
 def test_opening_what_is_unreadable_raises(bench: Bench, name: str) -> None:
     """Exit code 3; of another layout exit code 1, naming the check."""
     kind: type[Exception] = UnreadableFileError

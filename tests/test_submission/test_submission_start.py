@@ -30,7 +30,6 @@ class World:
     size: Size
     root: Path
     positions: Mapping[int, Floats]  # every frame, shape [frame, particle, 2]
-    material: Mapping[int, NDArray[np.int8]]
 
     @property
     def input_frames(self) -> int:
@@ -68,7 +67,7 @@ class World:
         return validate(path, root=self.root)
 
 
-SPLITS = ["curl-noise", "multimaterial"]
+SPLITS = ["curl-noise", "fluid"]
 
 
 @pytest.fixture(scope="module", params=SPLITS)
@@ -80,12 +79,10 @@ def world(
     size = load().size(request.param, "tiny")
     truth = Truth(size, root)
     positions = {}
-    material = {}
     for scenario in sorted(size.subsets["test"]):
         with read_scenario(truth.path(scenario)) as file:
             positions[scenario] = file.read("position")
-            material[scenario] = file.read("material")
-    return World(size, root, positions, material)
+    return World(size, root, positions)
 
 
 def rng(scenario: int) -> np.random.Generator:
@@ -101,12 +98,6 @@ def permuted(world: World, scenario: int) -> Floats:
     order = rng(scenario).permutation(world.size.particles)
     truth = world.truth(scenario)
     return truth[:, order]
-
-
-def under_the_next_number(world: World, scenario: int) -> Floats:
-    """The truth, every particle stored as the next one."""
-    truth = world.truth(scenario)
-    return np.roll(truth, 1, axis=1)
 
 
 def two_particles_exchanged(world: World, scenario: int) -> Floats:
@@ -129,7 +120,6 @@ def permuted_and_at_rest(world: World, scenario: int) -> Floats:
     "predict",
     [
         permuted,
-        under_the_next_number,
         two_particles_exchanged,
         permuted_and_at_rest,
     ],
@@ -163,29 +153,6 @@ def noisy(amplitude: float) -> Predict:
     return predict
 
 
-def partly_lost(world: World, scenario: int) -> Floats:
-    """A third of the particles anywhere within a twentieth of the box."""
-    position = world.truth(scenario).copy()
-    particle_count = position.shape[1]
-    is_lost = rng(scenario).random(particle_count) < 1 / 3
-    lost = position[:, is_lost]
-    error = rng(scenario).uniform(-0.05, 0.05, lost.shape)
-    position[:, is_lost] = lost + error
-    return position
-
-
-def in_one_point(world: World, scenario: int) -> Floats:
-    """All particles in the middle of the box."""
-    shape = world.truth(scenario).shape
-    return np.full(shape, 0.5)
-
-
-def y_first(world: World, scenario: int) -> Floats:
-    """The components swapped."""
-    truth = world.truth(scenario)
-    return truth[..., ::-1]
-
-
 def one_frame_late(world: World, scenario: int) -> Floats:
     """The truth without its first frame; the last one is repeated."""
     truth = world.truth(scenario)
@@ -209,11 +176,7 @@ def another_scenario(world: World, scenario: int) -> Floats:
 @pytest.mark.parametrize(
     "predict",
     [
-        noisy(0.01),
         noisy(0.5),
-        partly_lost,
-        in_one_point,
-        y_first,
         one_frame_late,
         displacements,
         another_scenario,
