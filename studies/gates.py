@@ -43,7 +43,7 @@ from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
 from lagbench.baselines.simulator import GraphNetwork
-from lagbench.board.entry import Status, read_entry
+from lagbench.board.entry import read_entry
 from lagbench.board.folder import GATES, Folder
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Size
@@ -353,10 +353,9 @@ def active_rows(folder: Folder) -> list[Gates]:
     active_hashes = set()
     for entry_path in folder.entries():
         entry = read_entry(folder.path / entry_path)
-        if entry.status is Status.ACTIVE:
-            for prediction in entry.predictions:
-                if prediction.weights is not None:
-                    active_hashes.add(prediction.weights.sha256)
+        for prediction in entry.predictions:
+            if prediction.weights is not None:
+                active_hashes.add(prediction.weights.sha256)
     rows = []
     for line in read_recorded(folder.path / GATES):
         if line["weights_sha256"] in active_hashes:
@@ -409,7 +408,7 @@ def board_weights(folder: Folder, splits: Sequence[str], size: str) -> list[Path
     for entry_path in folder.entries():
         entry = read_entry(folder.path / entry_path)
         is_wanted = entry.split in splits and entry.size == size
-        if not is_wanted or entry.status is not Status.ACTIVE:
+        if not is_wanted:
             continue
         for prediction in entry.predictions:
             weights = prediction.weights

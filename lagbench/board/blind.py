@@ -15,7 +15,7 @@ from lagbench.metrics.table import METRICS
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import shipped
 from lagbench.references.table import NAIVE, REFERENCES
-from lagbench.scoring.references import check_train
+from lagbench.scoring.score import check_train
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import best_reference
 from lagbench.scoring.task import load_scored_task, predict_reference

@@ -17,11 +17,10 @@ import numpy as np
 
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size, load
-from lagbench.errors import ChecksFailedError, LagbenchError
+from lagbench.errors import LagbenchError
 from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import STATISTICS
 from lagbench.references.table import REFERENCES
-from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import (
     read_statistics,
@@ -32,17 +31,15 @@ from lagbench.work.run import Progress
 from .entry import (
     RELATIVE_TOLERANCE,
     Entry,
-    Status,
-    Summary,
     find_model,
     is_current,
     read_entry,
 )
-from .folder import SCORES, WEIGHTS, Folder, entry_path
+from .folder import SCORES, WEIGHTS, Folder
 from .gates import read_failed_gates
 from .ranking import combine, summarise
-from .shift import check_shift
-from .verified import Level, Verification, check_verified, record
+from .shift import SHIFT_SCORES
+from .verified import VERIFICATIONS, Level, Verification, record
 
 MOST_WEIGHTS = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version for good."""
@@ -112,17 +109,23 @@ def check_board(
             continue
         entries[path.as_posix()] = entry
         issues += check_entry(folder, path, entry, size)
-    for path in folder.reference_files():
-        try:
-            read_statistics(folder.path / path, known.size(*path.parts[1:3]))
-        except LagbenchError as error:
-            issues.append(str(error))
-            continue
-        if path.stem not in REFERENCES:
-            issues.append(f"{path}: no such reference predictor; remove the file")
-    issues += _check_strays(folder, entries)
-    issues += check_verified(folder, entries)
-    issues += check_shift(folder, entries, known)
+    # what no entry names, and weights beyond the size of all
+    named: set[Path] = set()
+    for entry in entries.values():
+        named |= {*entry.score_paths, *entry.weight_paths}
+    weight_files = folder.files(WEIGHTS)
+    if len(entries) == len(folder.entries()):
+        for path in (*folder.files(SCORES), *weight_files):
+            if path not in named:
+                issues.append(f"{path}: no entry names it; remove it")
+    total = sum((folder.path / path).stat().st_size for path in weight_files)
+    if total > MOST_WEIGHTS:
+        issues.append(
+            f"the weights have {total} bytes, at most {MOST_WEIGHTS} in all; name "
+            "larger ones by `weights: https://...` in the entry"
+        )
+    issues += VERIFICATIONS.find_stale(folder, entries)
+    issues += SHIFT_SCORES.find_stale(folder, entries)
     try:
         read_failed_gates(folder)
     except LagbenchError as error:
@@ -138,10 +141,37 @@ def check_board(
             progress=progress,
             write=False,
         )
-        try:
-            confirmed.append(_rescore(folder, path, card, entries))
-        except ChecksFailedError as error:
-            issues.append(str(error))
+        found = None
+        for name, entry in entries.items():
+            for file, score_path in zip(
+                entry.score.files, entry.score_paths, strict=True
+            ):
+                if file.predictions_sha256 == card.predictions_sha256:
+                    found = (name, score_path)
+        if found is None:
+            issues.append(f"{path}: no entry has these predictions")
+            continue
+        name, score_path = found
+        stored = read_statistics(folder.path / score_path)
+        with tempfile.TemporaryDirectory() as scratch:
+            new_path = Path(scratch) / "scores.nc"
+            write_statistics(card, new_path)
+            scored = read_statistics(new_path)
+        differing, difference = compare_tallies(scored.tallies, stored.tallies)
+        if differing:
+            issues.append(
+                f"{path}: scored again, {', '.join(differing[:5])} are not those of "
+                f"{score_path}"
+            )
+            continue
+        confirmed.append(
+            Confirmation(
+                predictions=path,
+                entry=name,
+                score_file=score_path.as_posix(),
+                difference=difference,
+            )
+        )
 
     def scored_again(line: Verification) -> Verification:
         if line.level is not Level.AS_SUBMITTED:
@@ -170,18 +200,13 @@ def check_entry(folder: Folder, path: Path, entry: Entry, size: Size) -> Iterato
         yield f"{path}: the entry belongs to {entry.yaml_path}; move it there"
         return
     current = is_current(entry.dataset, size)
-    if entry.status is Status.ACTIVE and not current:
+    if not current:
         yield (
             f"{path}: the data set has version {size.version}, the entry is of "
-            f"{entry.dataset.version}; predict again, or set status: withdrawn"
+            f"{entry.dataset.version}; predict again, or remove the entry"
         )
     if entry.name in REFERENCES:
         yield f"{path}: {entry.name} is the name of a reference predictor"
-    successor = entry.superseded_by
-    if successor is not None:
-        place = (entry.split, entry.size, successor)
-        if not (folder.path / entry_path(place)).is_file():
-            yield f"{path}: superseded_by names {successor}, which is not there"
     for prediction in entry.predictions:
         provenance = prediction.provenance
         if provenance is not None and {"test", "shift"} & set(provenance.subsets):
@@ -231,72 +256,17 @@ def check_entry(folder: Folder, path: Path, entry: Entry, size: Size) -> Iterato
     formed = summarise(combine([scores.tallies for scores in stored]))
     for name, summary in formed.items():
         stated = entry.score.metrics.get(name)
-        if stated is None or not _is_same_summary(summary, stated):
+        is_same = stated is not None
+        for (_, a), (_, b) in zip(summary, stated or summary, strict=True):
+            if a is None or b is None:
+                is_same &= a is b
+            else:
+                is_same &= math.isclose(
+                    a, b, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-300
+                )
+        if not is_same:
             yield f"{path}, score: {name} is not that of the score files; submit again"
             return
-
-
-def _is_same_summary(first: Summary, second: Summary) -> bool:
-    for (_, a), (_, b) in zip(first, second, strict=True):
-        if a is None or b is None:
-            if a is not b:
-                return False
-        elif not math.isclose(a, b, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-300):
-            return False
-    return True
-
-
-def _check_strays(folder: Folder, entries: Mapping[str, Entry]) -> Iterator[str]:
-    """Yield files that no entry names, and weights beyond the size of all."""
-    named: set[Path] = set()
-    for entry in entries.values():
-        named.update(entry.score_paths)
-        for prediction in entry.predictions:
-            if prediction.weights is not None:
-                path = Path(prediction.weights.path)
-                named |= {path, path.with_suffix(".json")}
-    if len(entries) == len(folder.entries()):
-        for path in (*folder.files(SCORES), *folder.files(WEIGHTS)):
-            if path not in named:
-                yield f"{path}: no entry names it; remove it"
-    total = sum((folder.path / one).stat().st_size for one in folder.files(WEIGHTS))
-    if total > MOST_WEIGHTS:
-        yield (
-            f"the weights have {total} bytes, at most {MOST_WEIGHTS} in all; name "
-            "larger ones by `weights: https://...` in the entry"
-        )
-
-
-def _rescore(
-    folder: Folder, path: Path, card: ScoreCard, entries: Mapping[str, Entry]
-) -> Confirmation:
-    """Compare predictions that were scored again with the entry that has them.
-
-    Raises:
-        ChecksFailedError: no entry has them, or its statistics are others.
-    """
-    for name, entry in entries.items():
-        for file, score_path in zip(entry.score.files, entry.score_paths, strict=True):
-            if file.predictions_sha256 != card.predictions_sha256:
-                continue
-            stored = read_statistics(folder.path / score_path)
-            with tempfile.TemporaryDirectory() as scratch:
-                new_path = Path(scratch) / "scores.nc"
-                write_statistics(card, new_path)
-                scored = read_statistics(new_path)
-            differing, difference = compare_tallies(scored.tallies, stored.tallies)
-            if differing:
-                raise ChecksFailedError(
-                    f"{path}: scored again, {', '.join(differing[:5])} are not those "
-                    f"of {score_path}"
-                )
-            return Confirmation(
-                predictions=path,
-                entry=name,
-                score_file=score_path.as_posix(),
-                difference=difference,
-            )
-    raise ChecksFailedError(f"{path}: no entry has these predictions")
 
 
 def compare_tallies(

@@ -33,13 +33,14 @@ from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.skill import compute_skill
 from lagbench.submission.truth import frames_to_predict
 
-from .entry import Entry, Status, data_set_of, is_current, read_entry
+from .entry import Entry, is_current, read_entry
 from .folder import Folder
 from .gates import EARLY_ERROR, gates_failed_by, read_failed_gates, with_early_gate
 from .ranking import CombinedScore, combine, combine_seeds
+from .records import record_of
 from .rows import TRIAL, Board, Curve, Row, Tab, Value
-from .shift import SUBSET, ShiftScores, read_shift, scores_of_seeds, shift_of
-from .verified import MeasuredCost, Verification, read_verified, verification_of
+from .shift import SHIFT_SCORES, SUBSET, ShiftScores, scores_of_seeds, shift_of
+from .verified import VERIFICATIONS, MeasuredCost, Verification
 
 CURVE_FRAMES = 40
 """Most frames of a curve."""
@@ -105,9 +106,9 @@ def collect(
 
     records = BoardRecords(
         folder=folder,
-        verified=read_verified(folder),
+        verified=VERIFICATIONS.read(folder),
         failed_gates=read_failed_gates(folder),
-        shift=read_shift(folder),
+        shift=SHIFT_SCORES.read(folder),
         metrics=metrics,
     )
     shown = list_data_sets(folder, known)
@@ -117,7 +118,7 @@ def collect(
             size = known.size(split, name)
             active = []
             for entry in entries.get((split, name), ()):
-                if entry.status is Status.ACTIVE and is_current(entry.dataset, size):
+                if is_current(entry.dataset, size):
                     active.append(entry)
             is_wanted = only is None or (split, name) in only
             if active or (is_wanted and (split, name) in shown):
@@ -141,8 +142,8 @@ def _make_tab(
 ) -> Tab:
     ranking = ranking_metric(size)
     references = []
-    for reference in _read_references(records.folder, size):
-        if ranking in reference.scores:
+    for reference in (shipped(size) or {}).values():
+        if reference.name in REFERENCES and ranking in reference.scores:
             references.append(reference)
     on_shift = {}
     if SUBSET in size.subsets:
@@ -152,7 +153,7 @@ def _make_tab(
     naive = _naive_among({one.name: one.scores[ranking] for one in references})
     naive_on_shift = _naive_among(on_shift)
     verifications = {
-        entry.method: verification_of(entry, records.verified) for entry in entries
+        entry.method: record_of(entry, records.verified) for entry in entries
     }
     costs = FrameCosts.of(size, [one for one in verifications.values() if one])
 
@@ -400,34 +401,3 @@ def _rank(rows: Sequence[Row], truth_error: float | None) -> tuple[Row, ...]:
             )
         )
     return tuple(ranked)
-
-
-def _read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
-    """Return the reference predictors of a split and size.
-
-    The package ships their scores on our splits. On other splits the scorer measures
-    them beside a submission, and ``submit`` keeps them in the folder. Scores on another
-    data set are left out, and so are scores of a predictor that is no longer there.
-    """
-    shipped_scores = shipped(size)
-    if shipped_scores:
-        return tuple(one for one in shipped_scores.values() if one.name in REFERENCES)
-
-    references = []
-    for path in folder.reference_files(size.split, size.name):
-        file = folder.path / path
-        stored = read_statistics(file)
-        is_known = path.stem in REFERENCES
-        if not is_known or not is_current(data_set_of(stored.identity), size):
-            continue
-        read_statistics(file, size)  # refuses scores that do not fit the task
-        combined = combine([stored.tallies])
-        references.append(
-            ReferenceScores(
-                name=path.stem,
-                scores={name: one.score for name, one in combined.items()},
-                seconds_per_frame=math.nan,
-                correlation=np.empty(0),
-            )
-        )
-    return tuple(references)

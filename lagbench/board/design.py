@@ -79,35 +79,29 @@ def read_design(folder: Folder) -> tuple[DesignRow, ...]:
                     is_scored = scale_error(name, verdict.error) is not None
                     if name.startswith(family) and is_scored:
                         tasks.add(name)
-            if tasks:
-                rows.append(_make_row(family, method, budget, seeds, sorted(tasks)))
+            if not tasks:
+                continue
+            names = sorted(tasks)
+            scores = np.full((len(seeds), len(names)), np.nan)
+            seconds = []
+            for seed, entry in enumerate(seeds):
+                for number, name in enumerate(names):
+                    if name in entry.verdicts:
+                        error = entry.verdicts[name].error
+                        scores[seed, number] = scale_error(name, error)
+                        seconds.append(entry.seconds[name])
+            rows.append(
+                DesignRow(
+                    family=family,
+                    method=method,
+                    budget=budget,
+                    tasks=tuple(names),
+                    scores=scores,
+                    seconds=float(np.mean(seconds)),
+                )
+            )
     return tuple(
         sorted(rows, key=lambda row: (list(FAMILIES).index(row.family), row.budget))
-    )
-
-
-def _make_row(
-    family: str,
-    method: str,
-    budget: int,
-    seeds: list[DesignEntry],
-    tasks: list[str],
-) -> DesignRow:
-    scores = np.full((len(seeds), len(tasks)), np.nan)
-    seconds = []
-    for seed, entry in enumerate(seeds):
-        for number, name in enumerate(tasks):
-            if name in entry.verdicts:
-                score = scale_error(name, entry.verdicts[name].error)
-                scores[seed, number] = score
-                seconds.append(entry.seconds[name])
-    return DesignRow(
-        family=family,
-        method=method,
-        budget=budget,
-        tasks=tuple(tasks),
-        scores=scores,
-        seconds=float(np.mean(seconds)),
     )
 
 

@@ -11,7 +11,7 @@ import datetime
 import enum
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -122,14 +122,6 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 Date = Annotated[
     datetime.date, BeforeValidator(_parse_date), AfterValidator(_check_date)
 ]
-
-
-class Status(enum.StrEnum):
-    """Status of an entry on the board."""
-
-    ACTIVE = "active"
-    SUPERSEDED = "superseded"
-    WITHDRAWN = "withdrawn"
 
 
 class Strict(BaseModel):
@@ -354,9 +346,6 @@ class Entry(About):
     ]
     date: Date
     command: Annotated[Long, Field(min_length=1)]
-    status: Annotated[Status, Field(strict=False)] = Status.ACTIVE
-    superseded_by: Name | None = None
-    reason: Long = Field(default="", description="why it was superseded or withdrawn")
     dataset: DataSet
     predictions: Annotated[
         tuple[Prediction, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)
@@ -408,6 +397,16 @@ class Entry(About):
         return tuple(file.sha256 for file in self.score.files)
 
     @property
+    def weight_paths(self) -> set[Path]:
+        """Paths of weights and of logs of their trainings, relative to the folder."""
+        paths = set()
+        for prediction in self.predictions:
+            if prediction.weights is not None:
+                path = Path(prediction.weights.path)
+                paths |= {path, path.with_suffix(".json")}
+        return paths
+
+    @property
     def models(self) -> set[tuple[int | None, str]]:
         """Seed and hash of the models that lie on the board."""
         return {
@@ -419,9 +418,9 @@ class Entry(About):
 
 KEY_ORDER = (
     *("format", "split", "size", "method", "name", "authors", "affiliation"),
-    *("licence", "code", "paper", "weights", "date", "notes", "status"),
-    *("superseded_by", "reason", "kind", "training", "budget", "parameters"),
-    *("hardware", "command", "dataset", "predictions", "cost", "score"),
+    *("licence", "code", "paper", "weights", "date", "notes", "kind", "training"),
+    *("budget", "parameters", "hardware", "command", "dataset", "predictions"),
+    *("cost", "score"),
 )
 """Order of the keys of an entry's file."""
 
@@ -535,10 +534,3 @@ def is_current(dataset: DataSet, size: Size) -> bool:
     if major_of(dataset.version) != size.major:
         return False
     return size.measured is None or dataset.sha256 == size.measured.dataset_sha256
-
-
-def data_set_of(identity: Mapping[str, str]) -> DataSet:
-    """Return the data set that a score file says its scores belong to."""
-    return DataSet.model_construct(
-        version=identity["dataset_version"], sha256=identity["dataset_sha256"]
-    )

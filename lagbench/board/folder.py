@@ -2,7 +2,6 @@
 
 submissions/<split>/<size>/<method>.yaml      entries
 scores/<split>/<size>/<method>[_<seed>].nc    their score files
-floors/<split>/<size>/<name>.nc               scores of the reference predictors
 weights/<split>/<size>/<method>_<seed>.safetensors   weights, or .onnx; a log .json
 design/<name>.json                            judged entries of the design track
 verified.yaml, shift.yaml, gates.json, schema.json, index.html, README.md
@@ -17,12 +16,11 @@ from pathlib import Path
 import filelock
 
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.scoring.boards import SUBMISSIONS, require_board
+from lagbench.scoring.boards import SUBMISSIONS, find_board
 
 Place = tuple[str, str, str]  # split, size and method
 
 SCORES = "scores"
-REFERENCES = "floors"
 WEIGHTS = "weights"
 DESIGN = "design"
 PAGE = "index.html"
@@ -37,7 +35,6 @@ TOP_FILES = (PAGE, SCHEMA, VERIFIED, GATES, SHIFT, README)
 ENDINGS = {
     SUBMISSIONS: (".yaml",),
     SCORES: (".nc",),
-    REFERENCES: (".nc",),
     WEIGHTS: (".onnx", ".safetensors", ".json"),
 }
 
@@ -93,7 +90,7 @@ class Folder:
 
     def require(self) -> None:
         """Refuse a folder that is no leaderboard."""
-        require_board(self.path)
+        find_board(self.path)
 
     def require_room(self) -> None:
         """Refuse to begin a leaderboard among other files."""
@@ -116,14 +113,6 @@ class Folder:
         for path in self.entries():
             data_sets[(path.parts[1], path.parts[2])] = None
         return tuple(data_sets)
-
-    def reference_files(self, split: str = "", size: str = "") -> tuple[Path, ...]:
-        """Return the score files of reference predictors of a data set, or of all."""
-        paths = []
-        for path in self.files(REFERENCES):
-            if not split or path.parts[1:3] == (split, size):
-                paths.append(path)
-        return tuple(paths)
 
     def files(self, top: str) -> tuple[Path, ...]:
         """Return the files <top>/<split>/<size>/<name> of their endings, by name."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ from lagbench.models.onnx_model import OnnxModel
 from lagbench.scoring.task import SUBMISSION, ScoredTask, measure_rows
 from lagbench.work.run import Meter, Progress
 
-from .entry import Entry, Prediction, Status, find_model, is_current, read_entry
+from .entry import Entry, Prediction, find_model, is_current, read_entry
 from .folder import Folder
 
 
@@ -43,12 +43,9 @@ class Runner(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class Failure:
-    """An entry that could not be run."""
-
-    entry: str  # as in "cavity/mini/gns"
-    error: LagbenchError
+def exit_code_of(failures: Mapping[str, LagbenchError]) -> int:
+    """Return the exit code of the first failure; 0 without any."""
+    return next((error.exit_code for error in failures.values()), 0)
 
 
 def choose_data_sets(
@@ -153,7 +150,7 @@ class ModelRuns:
                 continue
             entry = read_entry(self.folder.path / path)
             present = is_current(entry.dataset, self.size(entry))
-            if entry.status is Status.ACTIVE and entry.models and present:
+            if entry.models and present:
                 chosen.append(entry)
         return chosen
 

@@ -29,24 +29,24 @@ from lagbench.metrics.aggregate import Tally, score
 from lagbench.metrics.table import METRICS
 from lagbench.references.predictor import Kind, given_in
 from lagbench.references.table import references_of
-from lagbench.scoring.references import time_frames
+from lagbench.scoring.scenarios import time_frames
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.machine import available_cores, processor_name
 from lagbench.work.run import Meter, Progress
 
 from .entry import Entry, today
-from .models import Failure, ModelRuns, Runner, name_seed
+from .models import ModelRuns, Runner, exit_code_of, name_seed
+from .records import record_of
 from .verified import (
+    VERIFICATIONS,
     Level,
     MeasuredCost,
     Reproduction,
     Verification,
     empty_record,
-    read_verified,
     record,
     relative_difference,
-    verification_of,
 )
 
 TOLERANCE = 1e-3
@@ -82,7 +82,8 @@ class ReproduceResult:
     predicted: list[str] = field(default_factory=list)
     # whose costs were measured in this run, as in "cavity/mini/gns"
     measured: list[str] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
+    # by name of the entry, the first of each
+    failures: dict[str, LagbenchError] = field(default_factory=dict)
 
     @property
     def differing(self) -> list[str]:
@@ -104,7 +105,7 @@ class ReproduceResult:
             "predicted": self.predicted,
             "measured": self.measured,
             "differing": self.differing,
-            "failures": {one.entry: str(one.error) for one in self.failures},
+            "failures": {name: str(error) for name, error in self.failures.items()},
         }
 
     @property
@@ -112,9 +113,7 @@ class ReproduceResult:
         """0 where all scores agree, 1 where some differ, else that of a failure."""
         if self.differing:
             return ChecksFailedError.exit_code
-        if self.failures:
-            return self.failures[0].error.exit_code
-        return 0
+        return exit_code_of(self.failures)
 
 
 def reproduce(
@@ -212,16 +211,14 @@ class _Run:
         """Return the record of an entry: of this run, else the written one."""
         line = self._lines.get(entry.yaml_path.as_posix())
         if line is None:
-            line = verification_of(entry, read_verified(self.runs.folder))
+            line = record_of(entry, VERIFICATIONS.read(self.runs.folder))
         return line
 
     def keep(self, entry: Entry, error: LagbenchError) -> None:
         """Keep the first error of an entry, or raise it."""
         if self.raises:
             raise error
-        name = "/".join(entry.place)
-        if name not in [failure.entry for failure in self.result.failures]:
-            self.result.failures.append(Failure(entry=name, error=error))
+        self.result.failures.setdefault("/".join(entry.place), error)
 
     def _task(self, entry: Entry) -> ScoredTask:
         key = (entry.split, entry.size)

@@ -8,7 +8,7 @@ it is data, never markup.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -213,32 +213,28 @@ def conclude(board: Board) -> list[str]:
         if tab.size.name != TRIAL and tab.is_judged and tab.best_model is not None:
             judged.append(tab)
     open_count = sum(tab.size.name != TRIAL for tab in board.tabs) - len(judged)
-    sentences = list(_state_result(judged, board))
-    if open_count:
-        sentences.append(
-            f"{open_count} data sets are not judged: they lack a model with a known "
-            f"speedup, or the restarted simulator. {UNJUDGED}"
-        )
-    return sentences
-
-
-def _state_result(judged: list[Tab], board: Board) -> Iterator[str]:
-    if not judged:
-        yield "It is not shown on any data set that learning pays."
-        return
     pays = [tab for tab in board.pays() if tab in judged]
     total = len(judged)
-    if pays:
+    if not judged:
+        result = "It is not shown on any data set that learning pays."
+    elif pays:
         names = ", ".join(tab.name for tab in pays)
-        yield (
+        result = (
             f"Learning pays on {len(pays)} of {total} data sets ({names}): there a "
             "network reaches its accuracy in less time than any classical or "
             "calibrated solver here."
         )
     else:
-        yield (
+        result = (
             f"It is not shown that learning pays on any of {total} judged data sets: "
             "on each a classical or calibrated solver is as accurate as the best "
             "network in the same time or less, or the difference is within the 95 % "
             "interval."
         )
+    if not open_count:
+        return [result]
+    return [
+        result,
+        f"{open_count} data sets are not judged: they lack a model with a known "
+        f"speedup, or the restarted simulator. {UNJUDGED}",
+    ]

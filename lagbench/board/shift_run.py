@@ -21,8 +21,8 @@ from lagbench.metrics.table import METRICS
 from lagbench.scoring.task import load_scored_task
 from lagbench.work.run import Progress
 
-from .models import Failure, ModelRuns, name_seed
-from .shift import SUBSET, ShiftModel, ShiftScores, read_shift, record_shift, shift_of
+from .models import ModelRuns, exit_code_of, name_seed
+from .shift import SHIFT_SCORES, SUBSET, ShiftModel, ShiftScores, shift_of
 
 DIGITS = 9
 """Digits of a score in the file."""
@@ -37,7 +37,8 @@ class ShiftResult:
     entries: dict[str, ShiftScores] = field(default_factory=dict)
     # predicted in this run, as in "cavity/mini/gns, seed 0"
     predicted: list[str] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
+    # by name of the entry
+    failures: dict[str, LagbenchError] = field(default_factory=dict)
 
     def to_plain(self) -> dict[str, object]:
         """Return plain values, which JSON can hold."""
@@ -48,15 +49,13 @@ class ShiftResult:
             "folder": str(self.folder),
             "entries": entries,
             "predicted": self.predicted,
-            "failures": {one.entry: str(one.error) for one in self.failures},
+            "failures": {name: str(error) for name, error in self.failures.items()},
         }
 
     @property
     def exit_code(self) -> int:
         """0 where all models ran, else the exit code of the first failure."""
-        if self.failures:
-            return self.failures[0].error.exit_code
-        return 0
+        return exit_code_of(self.failures)
 
 
 def score_on_shift(
@@ -106,9 +105,10 @@ def score_on_shift(
             for prediction in entry.predictions:
                 if prediction.weights is None:
                     continue
-                present = shift_of(entry, tier, read_shift(folder))
+                present = shift_of(entry, tier, SHIFT_SCORES.read(folder))
+                seed = prediction.seed
                 seeds = () if present is None else [one.seed for one in present.models]
-                if prediction.seed in seeds and not again:
+                if seed in seeds and not again:
                     continue
                 manifest = read_manifest(runs.root, tier.split, tier.name, tier.major)
                 if manifest is None or SUBSET not in manifest.subset_sha256:
@@ -124,18 +124,29 @@ def score_on_shift(
                     raise ChecksFailedError(f"{name}: no finite score on {SUBSET}")
                 values = [round_digits(one, DIGITS) for one in scores.values.tolist()]
                 written = ShiftModel(
-                    seed=prediction.seed,
+                    seed=seed,
                     model=prediction.weights.sha256,
                     values=dict(zip(scores.scenarios, values, strict=True)),
                 )
-                subset_sha256 = manifest.subset_sha256[SUBSET]
-                record_shift(folder, entry, tier, written, subset_sha256)
+                with SHIFT_SCORES.changing(folder) as records:
+                    models = [written]
+                    present = shift_of(entry, tier, records)
+                    if present is not None:
+                        kept = (one for one in present.models if one.seed != seed)
+                        models += kept
+                    models.sort(key=lambda one: one.seed or 0)
+                    records[entry.yaml_path.as_posix()] = ShiftScores(
+                        metric=entry.score.ranking_metric,
+                        dataset_sha256=entry.dataset.sha256,
+                        subset_sha256=manifest.subset_sha256[SUBSET],
+                        models=tuple(models),
+                    )
                 result.predicted.append(name)
         except LagbenchError as error:
             if entries:
                 raise
-            result.failures.append(Failure(entry="/".join(entry.place), error=error))
-        present = shift_of(entry, tier, read_shift(folder))
+            result.failures["/".join(entry.place)] = error
+        present = shift_of(entry, tier, SHIFT_SCORES.read(folder))
         if present is not None:
             result.entries[entry.yaml_path.as_posix()] = present
     return result

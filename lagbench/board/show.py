@@ -40,23 +40,19 @@ def tables(board: Board, metrics: Collection[str] = ()) -> Iterator[Table]:
             for name in metrics:
                 value = row.metrics.get(name)
                 cells.append(format_number(None if value is None else value.mean))
-            rows.append((*cells, _remarks(row)))
+            remarks = [str(row.kind)]
+            if row.entry is not None:
+                remarks.append(describe_check(row))
+            if row.failed_gates:
+                remarks.append("under-trained")
+            if row.diverged:
+                remarks.append(f"{row.diverged} diverged")
+            rows.append((*cells, ", ".join([*remarks, *row.flags])))
         title = f"{tab.name} {tab.size.version}, score: {tab.ranking}"
         if tab.truth_error:
             title += f", truth error {format_number(tab.truth_error)}"
         headings = [column.label for column in columns]
         yield Table(title, (*headings, *metrics, "remarks"), tuple(rows), keys=2)
-
-
-def _remarks(row: Row) -> str:
-    remarks = [str(row.kind)]
-    if row.entry is not None:
-        remarks.append(describe_check(row))
-    if row.failed_gates:
-        remarks.append("under-trained")
-    if row.diverged:
-        remarks.append(f"{row.diverged} diverged")
-    return ", ".join([*remarks, *row.flags])
 
 
 def to_plain(board: Board) -> dict[str, Any]:
@@ -90,15 +86,6 @@ def to_plain(board: Board) -> dict[str, Any]:
 
 
 def _plain_row(row: Row) -> dict[str, Any]:
-    speedup = None
-    if row.speedup is not None:
-        low, high = row.speedup.interval
-        speedup = {
-            "value": digits(row.speedup.value),
-            "interval": [digits(low), digits(high)],
-            "at_least": row.speedup.at_least,
-            "classical_seconds": digits(row.speedup.classical_seconds),
-        }
     after: float | str | None = row.breakeven
     if row.breakeven is not None:
         after = "never" if math.isinf(row.breakeven) else digits(row.breakeven)
@@ -112,7 +99,7 @@ def _plain_row(row: Row) -> dict[str, Any]:
         "skill": _plain_value(row.skill),
         "skill_on_shift": _plain_value(row.shift_skill),
         "seconds_per_frame": row.seconds,
-        "speedup": speedup,
+        "speedup": row.speedup and row.speedup.as_json(),
         "why_no_speedup": row.why_no_speedup and str(row.why_no_speedup),
         "breakeven": after,
         "metrics": {name: _plain_value(one) for name, one in row.metrics.items()},

@@ -12,29 +12,19 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
-from lagbench.errors import (
-    UnreadableFileError,
-    UsageError,
-    WorkFailedError,
-    check_installed,
-)
+from lagbench.errors import UsageError, WorkFailedError, check_installed
 from lagbench.models.onnx_model import check_onnx
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.scoring.score_file import (
-    MAX_SCORE_BYTES,
-    read_statistics,
-    write_statistics,
-)
+from lagbench.scoring.score_file import MAX_SCORE_BYTES, write_statistics
 from lagbench.scoring.task import SUBMISSION
 from lagbench.submission.format import WRITE, Header
 from lagbench.submission.issues import ValidationResult
@@ -59,10 +49,7 @@ from .entry import (
     today,
     validate,
 )
-from .folder import REFERENCES as FLOORS
 from .folder import (
-    SHIFT,
-    VERIFIED,
     Folder,
     Place,
     entry_path,
@@ -70,8 +57,8 @@ from .folder import (
     weights_path,
 )
 from .ranking import combine, scored_file, summarise
-from .shift import remove_stale_scores
-from .verified import remove_stale_record
+from .shift import SHIFT_SCORES
+from .verified import VERIFICATIONS
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
 
@@ -79,21 +66,8 @@ TRAINING_LOG = "training.json"
 
 LONGEST_NAME = 100
 
-NO_PREDICTIONS = 64 * "0"
-"""Hash in score files of reference predictors."""
-
 SHARED_LABELS = ("split", "size", "dataset_sha256", "method")
 """Labels of predictions that all seeds of a method share."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PredictionsFile:
-    """A valid file of predictions."""
-
-    path: Path
-    header: Header
-    sha256: str  # content hash
-    validation: ValidationResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +102,6 @@ def submit(
     examined: Callable[[ValidationResult], None] | None = None,
 ) -> SubmitResult:
     """Score predictions and write their entry and score files.
-
-    Score files of reference predictors that the board lacks are written, too.
 
     Args:
         predictions: files of predictions, one per seed.
@@ -166,8 +138,10 @@ def submit(
         folder.require()
 
     known = registry or load()
-    files = []
-    for path in map(Path, predictions):
+    paths = [Path(path) for path in predictions]
+    headers = []
+    validations = []
+    for path in paths:
         check_file(path, fix=WRITE)
         validation = validate_predictions(
             path, root=root, require_truth=True, registry=registry
@@ -177,7 +151,6 @@ def submit(
         validation.check()
         with open_predictions(path) as opened:
             header = opened.header
-            sha256 = validation.sha256 or opened.content_sha256()
         if header.split not in known.splits:
             raise UsageError(
                 f"{path}: {header.split} is a split of your own; a leaderboard takes "
@@ -191,12 +164,8 @@ def submit(
         provenance = header.provenance
         if provenance is not None and {"test", "shift"} & set(provenance.subsets):
             raise UsageError(f"{path}: the model was trained on scored scenarios")
-        files.append(
-            PredictionsFile(
-                path=path, header=header, sha256=sha256, validation=validation
-            )
-        )
-    headers = [file.header for file in files]
+        headers.append(header)
+        validations.append(validation)
     for name in SHARED_LABELS:
         labels = {str(getattr(header, name)) for header in headers}
         if len(labels) > 1:
@@ -228,25 +197,39 @@ def submit(
             f"the leaderboard has an entry {'/'.join(place)}; --replace replaces it, "
             "or name another --method"
         )
-    about = _describe(headers, meta)
+    # keys of meta, else of the predictions
+    header = headers[0]
+    keys = {name: getattr(meta, name) for name in About.model_fields}
+    keys["name"] = meta.name or header.method[:LONGEST_NAME]
+    keys["date"] = meta.date or today()
+    keys["training"] = meta.training or (header.training or "")[:LONGEST_TEXT]
+    if meta.parameters is None:
+        keys["parameters"] = header.parameters
+    if meta.cost is None:
+        keys["cost"] = mean_cost(headers, meta.solver_seconds_per_frame)
+    budgets = [header.budget for header in headers]
+    mean_budget = EntryBudget.mean_over_seeds(header.size, budgets)
+    if mean_budget is not None:
+        keys["budget"] = mean_budget
+    about = validate(About, keys, "the description")
 
     cards = []
-    for file in files:
+    for path, validation in zip(paths, validations, strict=True):
         card = score(
-            file.path,
+            path,
             root=root,
             packages=False,  # an entry tells nothing of the submitter's packages
             workers=workers,
             registry=registry,
             progress=progress,
             write=False,
-            validated=file.validation,
+            validated=validation,
         )
         cards.append(card)
     try:
         with folder.lock():
             return _publish(
-                folder, place, about, meta.urls, files, cards, weights_by_seed
+                folder, place, about, meta.urls, paths, cards, weights_by_seed
             )
     except OSError as error:
         raise WorkFailedError(
@@ -281,31 +264,12 @@ def _pair_weights(headers: Sequence[Header], paths: Sequence[Path]) -> dict[int,
     return weights
 
 
-def _describe(headers: Sequence[Header], meta: Meta) -> About:
-    """Return the description of the method: keys of meta, else of the predictions."""
-    header = headers[0]
-    keys = {name: getattr(meta, name) for name in About.model_fields}
-    keys["name"] = meta.name or header.method[:LONGEST_NAME]
-    keys["date"] = meta.date or today()
-    keys["training"] = meta.training or (header.training or "")[:LONGEST_TEXT]
-    if meta.parameters is None:
-        keys["parameters"] = header.parameters
-    if meta.cost is None:
-        keys["cost"] = mean_cost(headers, meta.solver_seconds_per_frame)
-    mean_budget = EntryBudget.mean_over_seeds(
-        header.size, [header.budget for header in headers]
-    )
-    if mean_budget is not None:
-        keys["budget"] = mean_budget
-    return validate(About, keys, "the description")
-
-
 def _publish(
     folder: Folder,
     place: Place,
     about: About,
     urls: Sequence[str | None],
-    files: Sequence[PredictionsFile],
+    predictions: Sequence[Path],
     cards: Sequence[ScoreCard],
     weights: Mapping[int, Path],
 ) -> SubmitResult:
@@ -320,12 +284,15 @@ def _publish(
             copies[path] = Path(scratch) / f"{len(copies)}{path.suffix}"
             return copies[path]
 
-        predictions = []
+        submitted = []
         scored_files = []
-        paths = score_paths(place, [file.header.seed for file in files])
-        urls = urls or [None] * len(files)
-        for file, card, path, url in zip(files, cards, paths, urls, strict=True):
-            copy = stage(path)
+        seeds = [card.header.seed for card in cards]
+        score_files = score_paths(place, seeds)
+        urls = urls or [None] * len(cards)
+        for path, card, score_file, url in zip(
+            predictions, cards, score_files, urls, strict=True
+        ):
+            copy = stage(score_file)
             write_statistics(card, copy, option="--board")
             if copy.stat().st_size > MAX_SCORE_BYTES:
                 raise WorkFailedError(
@@ -333,26 +300,43 @@ def _publish(
                     "leaderboard takes a data set of so many scenarios"
                 )
             scored_files.append(scored_file(card, copy))
-            predictions.append(
+
+            header = card.header
+            source = weights.get(header.seed or 0)
+            named_weights = None
+            if source is not None:
+                inner = source.resolve()
+                board = folder.path.resolve()
+                if inner.is_relative_to(board):
+                    inner = inner.relative_to(board)
+                else:
+                    inner = weights_path(place, header.seed, source)
+                    shutil.copyfile(source, stage(inner))
+                    for log in (
+                        source.with_suffix(".json"),
+                        source.with_name(TRAINING_LOG),
+                    ):
+                        # the JSON file of `lagbench predict` about costs has no step
+                        if log.is_file() and "step" in json.loads(log.read_bytes()):
+                            shutil.copyfile(log, stage(inner.with_suffix(".json")))
+                            break
+                named_weights = Weights(
+                    path=inner.as_posix(), sha256=file_sha256(source)
+                )
+            submitted.append(
                 Prediction(
-                    seed=file.header.seed,
-                    sha256=file.sha256,
+                    seed=header.seed,
+                    sha256=card.predictions_sha256,
                     url=url,
-                    bytes=file.path.stat().st_size,
-                    budget=file.header.budget,
-                    provenance=file.header.provenance,
-                    weights=_stage_weights(
-                        folder,
-                        stage,
-                        weights.get(file.header.seed or 0),
-                        place,
-                        file.header.seed,
-                    ),
+                    bytes=path.stat().st_size,
+                    budget=header.budget,
+                    provenance=header.provenance,
+                    weights=named_weights,
                 )
             )
         tallies = [card.tallies[SUBMISSION] for card in cards]
         split, size, method = place
-        header = files[0].header
+        header = cards[0].header
         entry = validate(
             Entry,
             {
@@ -364,7 +348,7 @@ def _publish(
                 "dataset": DataSet(
                     version=header.dataset_version, sha256=header.dataset_sha256
                 ),
-                "predictions": tuple(predictions),
+                "predictions": tuple(submitted),
                 "score": ScoreBlock(
                     lagbench=version("lagbench"),
                     dataset_sha256=header.dataset_sha256,
@@ -376,18 +360,28 @@ def _publish(
             "the entry",
         )
         stage(entry.yaml_path).write_bytes(entry_bytes(entry))
-        references = _write_references(cards[0], folder)
         for path, copy in copies.items():
             target = folder.path / path
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(copy, target)
 
     written = [folder.path / path for path in copies]
-    if remove_stale_record(folder, entry):
-        written.append(folder.path / VERIFIED)
-    if remove_stale_scores(folder, entry):
-        written.append(folder.path / SHIFT)
-    removed = _remove_stale_files(folder, entry, previous)
+    for records in (VERIFICATIONS, SHIFT_SCORES):
+        if records.remove_stale(folder, entry):
+            written.append(folder.path / records.name)
+
+    # scores and weights of the entry before that nothing names any more
+    stale: set[Path] = set()
+    if previous is not None:
+        stale = set(previous.score_paths) - set(entry.score_paths)
+        stale |= previous.weight_paths
+        for path in folder.entries():
+            stale -= read_entry(folder.path / path).weight_paths
+    removed = []
+    for path in sorted(stale):
+        if (folder.path / path).is_file():
+            (folder.path / path).unlink()
+            removed.append(folder.path / path)
     summary = entry.score.metrics[entry.score.ranking_metric]
     return SubmitResult(
         split=split,
@@ -400,78 +394,6 @@ def _publish(
         has_cost=entry.cost is not None,
         board=folder.path,
         # the entry first, although it is moved last
-        files=(*reversed(written), *references),
-        removed=removed,
+        files=tuple(reversed(written)),
+        removed=tuple(removed),
     )
-
-
-def _stage_weights(
-    folder: Folder,
-    stage: Callable[[Path], Path],
-    source: Path | None,
-    place: Place,
-    seed: int | None,
-) -> Weights | None:
-    """Copy weights and the log of their training, unless they lie there already."""
-    if source is None:
-        return None
-    sha256 = file_sha256(source)
-    board = folder.path.resolve()
-    if source.resolve().is_relative_to(board):
-        inner = source.resolve().relative_to(board)
-        return Weights(path=inner.as_posix(), sha256=sha256)
-    path = weights_path(place, seed, source)
-    shutil.copyfile(source, stage(path))
-    for log in (source.with_suffix(".json"), source.with_name(TRAINING_LOG)):
-        # the JSON file that `lagbench predict` writes about costs has no step
-        if log.is_file() and "step" in json.loads(log.read_bytes()):
-            shutil.copyfile(log, stage(path.with_suffix(".json")))
-            break
-    return Weights(path=path.as_posix(), sha256=sha256)
-
-
-def _remove_stale_files(
-    folder: Folder, entry: Entry, previous: Entry | None
-) -> tuple[Path, ...]:
-    """Remove scores and weights of the entry before that nothing names any more."""
-    if previous is None:
-        return ()
-    stale = set(previous.score_paths) - set(entry.score_paths)
-    for prediction in previous.predictions:
-        if prediction.weights is not None:
-            path = Path(prediction.weights.path)
-            stale |= {path, path.with_suffix(".json")}
-    for path in folder.entries():
-        for prediction in read_entry(folder.path / path).predictions:
-            if prediction.weights is not None:
-                used = Path(prediction.weights.path)
-                stale -= {used, used.with_suffix(".json")}
-    removed = []
-    for path in sorted(stale):
-        if (folder.path / path).is_file():
-            (folder.path / path).unlink()
-            removed.append(folder.path / path)
-    return tuple(removed)
-
-
-def _write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
-    """Write the references of a score card that the folder lacks; return the files."""
-    header = card.header
-    data_sha256 = header.dataset_sha256
-    data_set_folder = folder.path / FLOORS / header.split / header.size
-    written = []
-    for name in card.tallies.keys() - {SUBMISSION}:
-        path = data_set_folder / f"{name}.nc"
-        with suppress(UnreadableFileError):
-            if read_statistics(path).identity["dataset_sha256"] == data_sha256:
-                continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        reference_card = replace(
-            card,
-            header=header.model_copy(update={"method": name}),
-            predictions_sha256=NO_PREDICTIONS,
-            tallies={SUBMISSION: card.tallies[name]},
-        )
-        write_statistics(reference_card, path, option="--board")
-        written.append(path)
-    return tuple(sorted(written))

@@ -1,24 +1,18 @@
 """The records of the maintainers, leaderboard/verified.yaml.
 
 They say how far the maintainers followed the scores of an entry: they scored its
-predictions again, or ran its models, and what a frame of a model costs. They lie apart
-from the entries, so that no submitter can claim them. A record holds while the entry
-has the very score files and models that the record names. ``leaderboard check
---predictions FILE --record`` and ``leaderboard reproduce`` write them.
+predictions again, or ran its models, and what a frame of a model costs. ``leaderboard
+check --predictions FILE --record`` and ``leaderboard reproduce`` write them.
 """
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import Annotated
 
-from pydantic import Field, RootModel
-
-from lagbench.atomic import write_atomically
-from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import LagbenchError
+from pydantic import Field
 
 from .entry import (
     MOST_SEEDS,
@@ -32,10 +26,9 @@ from .entry import (
     Short,
     Strict,
     today,
-    validate,
-    yaml_bytes,
 )
 from .folder import VERIFIED, Folder
+from .records import Record, RecordFile, record_of
 
 LEAST_SCORE = 1e-38
 """Size of a score, at least, to which a difference is relative: about the smallest
@@ -101,7 +94,7 @@ class MeasuredCost(Strict):
         return self.model_copy(update=own_time) == other
 
 
-class Verification(Strict):
+class Verification(Record):
     """The record of an entry."""
 
     scores: Annotated[
@@ -109,11 +102,16 @@ class Verification(Strict):
     ]
     lagbench: Short
     date: Date
-    level: Annotated[Level, Field(strict=False)] = Level.SCORED_AGAIN
+    level: Annotated[Level, Field(strict=False)]
     reproduced: Annotated[
         tuple[Reproduction, ...], Field(max_length=MOST_SEEDS, strict=False)
     ] = ()
     cost: MeasuredCost | None = None
+
+    def is_of(self, entry: Entry) -> bool:
+        """Return whether the record is of the scores and models of an entry."""
+        models = {(one.seed, one.model) for one in self.reproduced}
+        return self.scores == entry.score_hashes and models <= entry.models
 
     @property
     def is_complete(self) -> bool:
@@ -123,49 +121,19 @@ class Verification(Strict):
         )
 
 
-class VerifiedFile(RootModel[dict[str, Verification]]):
-    """Records by path of the entry, relative to the leaderboard's folder."""
-
-
-def read_verified(folder: Folder) -> dict[str, Verification]:
-    """Return the records by path of the entry; empty without the file.
-
-    Raises:
-        UnreadableFileError: the file cannot be read.
-        ChecksFailedError: it holds something else.
-    """
-    path = folder.path / VERIFIED
-    content = read_yaml(path) if path.exists() else None
-    return validate(VerifiedFile, content or {}, path).root
-
-
-def verification_of(
-    entry: Entry, verified: Mapping[str, Verification]
-) -> Verification | None:
-    """Return the record of an entry.
-
-    None without one, and where it is about other score files or models.
-    """
-    line = verified.get(entry.yaml_path.as_posix())
-    if line is None or line.scores != entry.score_hashes:
-        return None
-    if entry.models.issuperset((one.seed, one.model) for one in line.reproduced):
-        return line
-    return None
+VERIFICATIONS = RecordFile(VERIFIED, Verification)
+"""The file verified.yaml."""
 
 
 def record(
     folder: Folder, entry: Entry, change: Callable[[Verification], Verification]
-) -> Verification:
-    """Change the record of an entry, an empty one where it has none; return it."""
-    with folder.lock():
-        verified = read_verified(folder)
-        line = verification_of(entry, verified) or empty_record(entry)
-        renewed = {"lagbench": version("lagbench"), "date": today()}
+) -> None:
+    """Change the record of an entry, an empty one where it has none."""
+    renewed = {"lagbench": version("lagbench"), "date": today()}
+    with VERIFICATIONS.changing(folder) as records:
+        line = record_of(entry, records) or empty_record(entry)
         changed = change(line).model_copy(update=renewed)
-        verified[entry.yaml_path.as_posix()] = changed
-        _write(folder, verified)
-    return changed
+        records[entry.yaml_path.as_posix()] = changed
 
 
 def empty_record(entry: Entry) -> Verification:
@@ -176,49 +144,3 @@ def empty_record(entry: Entry) -> Verification:
         date=today(),
         level=Level.AS_SUBMITTED,
     )
-
-
-def remove_stale_record(folder: Folder, entry: Entry) -> bool:
-    """Remove the record of other score files of an entry; return whether there was."""
-    verified = read_verified(folder)
-    name = entry.yaml_path.as_posix()
-    if name not in verified or verification_of(entry, verified) is not None:
-        return False
-    del verified[name]
-    _write(folder, verified)
-    return True
-
-
-def check_verified(folder: Folder, entries: Mapping[str, Entry]) -> Iterator[str]:
-    """Yield the records that belong to no entry or do not show their level.
-
-    Args:
-        folder: the leaderboard's folder.
-        entries: the readable entries, by path.
-    """
-    try:
-        verified = read_verified(folder)
-    except LagbenchError as error:
-        yield str(error)
-        return
-    for name, line in verified.items():
-        entry = entries.get(name)
-        if entry is None or verification_of(entry, verified) is None:
-            yield (
-                f"{VERIFIED}, {name}: a record of other scores or models, or of no "
-                "entry; remove it"
-            )
-        elif line.level is Level.REPRODUCED and (
-            not line.reproduced or not all(model.agrees for model in line.reproduced)
-        ):
-            yield f"{VERIFIED}, {name}: the level is reproduced, and no models agree"
-
-
-def _write(folder: Folder, verified: Mapping[str, Verification]) -> None:
-    lines = {}
-    for path, line in sorted(verified.items()):
-        values = line.model_dump(exclude_defaults=True)
-        first_keys = {"scores": line.scores, "lagbench": line.lagbench}
-        always = {"date": line.date, "level": line.level}
-        lines[path] = first_keys | always | values
-    write_atomically(folder.path / VERIFIED, yaml_bytes(lines), option="--board")

@@ -237,8 +237,8 @@ def reproduce_command(
             progress=progress,
         )
     if not as_json:
-        for failure in result.failures:
-            print_on_stderr(f"{failure.entry}: {failure.error}")
+        for name, error in result.failures.items():
+            print_on_stderr(f"{name}: {error}")
     lines = _describe_reproduced(result, with_scores=with_scores, with_costs=with_costs)
     print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
     return result.exit_code
@@ -331,8 +331,8 @@ def shift_command(
             progress=progress,
         )
     if not as_json:
-        for failure in result.failures:
-            print_on_stderr(f"{failure.entry}: {failure.error}")
+        for name, error in result.failures.items():
+            print_on_stderr(f"{name}: {error}")
     print_result(
         result.to_plain(), _describe_shift(result), as_json=as_json, quiet=quiet
     )

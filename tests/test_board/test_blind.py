@@ -19,6 +19,7 @@ from lagbench.make.generate import generate
 SEED = 64 * "5"
 
 
+@pytest.mark.slow
 def test_models_are_scored_on_new_scenarios(
     model_board: ModelBoard, tmp_path: Path
 ) -> None:

@@ -31,7 +31,7 @@ from lagbench.board.gates import EARLY_ERROR, with_early_gate
 from lagbench.board.page import build, cost_chart, render, write_picture
 from lagbench.board.rows import Board, Row, Tab, Value
 from lagbench.board.show import to_plain
-from lagbench.board.verified import Level, read_verified
+from lagbench.board.verified import VERIFICATIONS, Level
 from lagbench.cli.program import app
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import ChecksFailedError, UsageError
@@ -211,20 +211,17 @@ def test_predictions_scored_again_are_recorded(
     assert result.findings == ()
     name = f"{PLACE}/damped.yaml"
     assert result.recorded == (name,)
-    assert read_verified(Folder(own.folder))[name].level is Level.SCORED_AGAIN
+    assert VERIFICATIONS.read(Folder(own.folder))[name].level is Level.SCORED_AGAIN
 
     own.submit(own.predict(still, "damped", seed=0), replace=True)
-    assert name not in read_verified(Folder(own.folder))
+    assert name not in VERIFICATIONS.read(Folder(own.folder))
     assert check_board(own.folder, predictions=paths[:1], **check).exit_code == 1
 
 
 def test_rows_stand_in_the_order_of_the_ranking_metric(tab: Tab) -> None:
-    """References among them; only entries have ranks."""
     means = [row.score.mean for row in tab.rows]
     assert means == sorted(means)
-    ranks = [row.rank for row in tab.rows if row.entry is not None]
-    assert ranks == [1, 2, 3]
-    assert all(row.rank is None for row in tab.rows if row.entry is None)
+    assert [row.rank for row in tab.rows] == [1, 2, 3]
 
 
 def test_entries_closer_than_the_truth_error_share_a_rank(tab: Tab) -> None:
@@ -236,10 +233,10 @@ def test_entries_closer_than_the_truth_error_share_a_rank(tab: Tab) -> None:
 
 
 def with_classical_side(tab: Tab) -> Tab:
-    """Return a tab whose rows all have a cost, and whose references are solvers."""
+    """Return a tab whose rows all have a cost; all but one are solvers."""
     rows = []
     for row in tab.rows:
-        kind = row.kind if row.entry else Kind.CLASSICAL
+        kind = row.kind if row.id == "damped" else Kind.CLASSICAL
         rows.append(replace(row, seconds=0.1, kind=kind))
     return replace(tab, rows=tuple(rows))
 
@@ -300,20 +297,18 @@ def test_the_page_asks_nothing_of_the_network_and_is_written_once(
     assert "default-src 'none'" in page
     own_part = page.split('<script type="application/json"')[0]
     assert not re.findall(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=", own_part)
-    assert build(own.folder, registry=own.registry).written == ()
     own.edit("noisy", put(name="another name"))
     with pytest.raises(ChecksFailedError):
         build(own.folder, check=True, registry=own.registry)
 
 
-def test_entries_of_other_data_and_withdrawn_ones_have_no_rows(own: BoardBench) -> None:
-    own.edit("noisy", put(status="withdrawn"))
+def test_entries_of_other_data_have_no_rows(own: BoardBench) -> None:
     own.edit(
         "flipping",
         lambda content: content["dataset"].update(version="1.0.0", sha256=64 * "1"),
     )
     (tab,) = collect(own.folder, registry=own.registry).tabs
-    assert [row.id for row in tab.rows if row.entry is not None] == ["damped"]
+    assert {row.id for row in tab.rows} == {"damped", "noisy"}
 
 
 def test_json_has_the_numbers_of_the_rows(board: Board, tab: Tab) -> None:

@@ -16,9 +16,9 @@ from lagbench.baselines.predict import predict
 from lagbench.board.entry import read_entry
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import TOLERANCE, reproduce, sample_scenarios
-from lagbench.board.shift import read_shift
+from lagbench.board.shift import SHIFT_SCORES
 from lagbench.board.shift_run import score_on_shift
-from lagbench.board.verified import Level, read_verified
+from lagbench.board.verified import VERIFICATIONS, Level
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
@@ -32,6 +32,7 @@ def own(model_board: ModelBoard, tmp_path: Path) -> ModelBoard:
     return replace(model_board, folder=tmp_path / "board")
 
 
+@pytest.mark.slow
 def test_a_model_gives_the_scores_of_its_entry(
     own: ModelBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -40,7 +41,7 @@ def test_a_model_gives_the_scores_of_its_entry(
     result = reproduce(own.folder, [NAME], root=own.root, time_solver=lambda *_: 0.5)
     assert result.exit_code == 0
     assert result.predicted == [f"{NAME}, seed 0"]
-    line = read_verified(Folder(own.folder))[PATH]
+    line = VERIFICATIONS.read(Folder(own.folder))[PATH]
     assert line.level is Level.REPRODUCED
     (one,) = line.reproduced
     assert one.difference <= TOLERANCE
@@ -57,7 +58,7 @@ def test_other_predictions_are_not_reproduced(own: ModelBoard) -> None:
     own.submit(own.shifted(1e-3), weights=[own.weights], replace=True)
     result = reproduce(own.folder, [NAME], root=own.root, costs=False)
     assert result.exit_code == ChecksFailedError.exit_code
-    assert read_verified(Folder(own.folder))[PATH].level is Level.AS_SUBMITTED
+    assert VERIFICATIONS.read(Folder(own.folder))[PATH].level is Level.AS_SUBMITTED
 
 
 def test_a_changed_model_is_not_run(own: ModelBoard) -> None:
@@ -74,7 +75,7 @@ def test_costs_are_not_recorded_on_a_busy_machine(
     monkeypatch.setattr("os.getloadavg", lambda: (99.0, 1.0, 1.0))
     with pytest.raises(WorkFailedError, match="busy"):
         reproduce(own.folder, [NAME], root=own.root, scores=False)
-    assert read_verified(Folder(own.folder)) == {}
+    assert VERIFICATIONS.read(Folder(own.folder)) == {}
 
 
 def test_a_sample_follows_from_the_model() -> None:
@@ -127,11 +128,11 @@ def test_scores_on_shift_are_those_of_predict_and_score(
     )
     card = lagbench.score(path, root=bench.root, workers=1)
     expected = card.scores[SUBMISSION][card.ranking]
-    (one,) = read_shift(Folder(bench.folder))[f"submissions/{name}.yaml"].models
+    (one,) = SHIFT_SCORES.read(Folder(bench.folder))[f"submissions/{name}.yaml"].models
     assert one.model == file_sha256(bench.weights)
     assert tuple(one.values) == expected.scenarios
     assert list(one.values.values()) == pytest.approx(expected.values, rel=1e-6)
     assert bench.find().findings == ()
     assert score_on_shift(bench.folder, [name], root=bench.root).predicted == []
     bench.submit(bench.shifted(1e-3), replace=True)
-    assert read_shift(Folder(bench.folder)) == {}
+    assert SHIFT_SCORES.read(Folder(bench.folder)) == {}
