@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from browser import Browser, browser
 from command_line import CliRunner, Result
 from filelock import FileLock
 from hypothesis import settings
@@ -37,9 +36,8 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Metric
 from lagbench.scoring import score as scorer
-from lagbench.scoring.score import ScenarioScores
+from lagbench.scoring.scenarios import ScenarioScores
 from lagbench.scoring.task import ScoredTask
-from lagbench.submission.format import FileInfo
 from lagbench.work.engine import ENGINES
 from lagbench.work.run import Meter
 
@@ -149,13 +147,6 @@ def no_flushes() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def running() -> Iterator[Browser]:
-    """One browser for all tests."""
-    with browser() as started:
-        yield started
-
-
 @pytest.fixture
 def home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A home folder of the user; the working folder is another one.
@@ -209,10 +200,9 @@ def references_once() -> Iterator[None]:
 
     def score_once(
         task: ScoredTask,
-        path: Path,
-        info: FileInfo,
         *,
         metrics: tuple[Metric, ...],
+        predictions: Path,
         references: Names,
         workers: int | None,
         scheduler: str | None,
@@ -221,9 +211,8 @@ def references_once() -> Iterator[None]:
         score_rows = functools.partial(
             SCORE_SCENARIOS,
             task,
-            path,
-            info,
             metrics=metrics,
+            predictions=predictions,
             workers=workers,
             scheduler=scheduler,
             meter=meter,

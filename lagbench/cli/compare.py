@@ -6,8 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from lagbench.scoring.compare import compare
-from lagbench.scoring.tables import comparison_lines, comparison_tables
+from lagbench.scoring.compare import compare, comparison_lines, comparison_tables
 
 from .options import (
     ExpectedSplitOption,

@@ -108,10 +108,10 @@ def score_command(
 def _print_cards(cards: Sequence[ScoreCard], *, every: bool) -> None:
     for card in cards:
         if every:
-            print_tables(card_tables(card, every=True, all_references=True))
+            print_tables(card_tables(card))
         else:
             print_tables([brief_table(card)])
-        for line in card_lines(card, brief=not every, every=every):
+        for line in card_lines(card, every=every):
             print_line(line)
         print_line(f"written: {', '.join(map(str, card.files))}")
     if not every:

@@ -24,30 +24,13 @@ def find_board(board: str | Path | None = None) -> Path:
             that of the clone.
 
     Raises:
-        UsageError: the named folder is no leaderboard, or no default is there.
+        UsageError: the folder has no entries and no room for them.
     """
-    if board is not None:
-        require_board(board)
-        return Path(board)
-    for folder in DEFAULT_BOARDS:
-        if is_board(folder):
+    folders = DEFAULT_BOARDS if board is None else (Path(board),)
+    for folder in folders:
+        if (folder / SUBMISSIONS).is_dir():
             return folder
-    raise UsageError("no leaderboard here; name one: --board FOLDER")
-
-
-def is_board(folder: Path) -> bool:
-    """Return whether a folder has entries, or room for them."""
-    return (folder / SUBMISSIONS).is_dir()
-
-
-def require_board(board: str | Path) -> None:
-    """Refuse a folder that is no leaderboard.
-
-    Raises:
-        UsageError: the folder has no entries.
-    """
-    if not is_board(Path(board)):
-        raise UsageError(
-            f"{board} is no leaderboard: it has no folder {SUBMISSIONS}; name another: "
-            "--board FOLDER"
-        )
+    raise UsageError(
+        f"{folders[0]} is no leaderboard: it has no folder {SUBMISSIONS}; name "
+        "another: --board FOLDER"
+    )

@@ -7,11 +7,9 @@ give the same bytes. Numbers have nine significant digits; undefined ones are nu
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,24 +69,6 @@ class ScoreCard:
         subject = f"{header.method!r} on {self.data_name}"
         ranking = f"{self.ranking} {self.submission[self.ranking].mean:.4g}"
         return f"<{type(self).__name__}: {subject}, {ranking}, skill {self.skill}>"
-
-    def _repr_html_(self) -> str:
-        """Return a table of the skill and the first metrics, for notebooks; escaped."""
-        header = self.header
-        lines = [("skill", "-" if self.skill is None else str(self.skill))]
-        for name in self.chosen_metrics[:BRIEF_ROWS]:
-            score = self.submission[name]
-            low, high = score.interval
-            cell = f"{score.mean:.4g}"
-            if not math.isnan(low):
-                cell += f" [{low:.3g}, {high:.3g}]"
-            lines.append((f"{name} [{score.metric.unit}]", cell))
-        rows = []
-        for line in lines:
-            cells = "".join(f"<td>{escape(cell)}</td>" for cell in line)
-            rows.append(f"<tr>{cells}</tr>")
-        caption = escape(f"{header.method} on {self.data_name}")
-        return f"<table><caption>{caption}</caption>{''.join(rows)}</table>"
 
     @property
     def data_name(self) -> str:
@@ -218,9 +198,23 @@ class ScoreCard:
         content["rows"] = {}
         content["against"] = {}
         for row, scores in self.scores.items():
-            content["rows"][row] = {
-                name: self._score_as_json(row, score) for name, score in scores.items()
-            }
+            lines: dict[str, dict[str, Any]] = {}
+            content["rows"][row] = lines
+            for name, score in scores.items():
+                lines[name] = {
+                    "mean": digits(score.mean),
+                    "interval": _bounds(score.interval),
+                    "values": [digits(value) for value in score.values.tolist()],
+                    "undefined": list(score.undefined),
+                }
+                if not score.metric.per_frame:
+                    continue
+                lines[name]["at"] = {}
+                for frame in self.reported_frames:
+                    at: dict[str, Any] = {"mean": digits(mean(score.at(frame)))}
+                    if row == SUBMISSION:
+                        at["interval"] = _bounds(score.interval_at(frame))
+                    lines[name]["at"][str(frame)] = at
             if row != SUBMISSION:
                 comparison = self.against(row)
                 content["against"][row] = {
@@ -241,22 +235,6 @@ class ScoreCard:
             {"check": one.check, "where": one.where, "what": one.what}
             for one in self.warnings
         ]
-        return content
-
-    def _score_as_json(self, row: str, score: Score) -> dict[str, Any]:
-        content: dict[str, Any] = {
-            "mean": digits(score.mean),
-            "interval": _bounds(score.interval),
-            "values": [digits(value) for value in score.values.tolist()],
-            "undefined": list(score.undefined),
-        }
-        if score.metric.per_frame:
-            content["at"] = {}
-            for frame in self.reported_frames:
-                at: dict[str, Any] = {"mean": digits(mean(score.at(frame)))}
-                if row == SUBMISSION:
-                    at["interval"] = _bounds(score.interval_at(frame))
-                content["at"][str(frame)] = at
         return content
 
 

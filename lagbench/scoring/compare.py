@@ -9,14 +9,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from lagbench.data.checksums import round_digits
 from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.local import locate_split
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, load
 from lagbench.errors import (
     DataError,
     UnreadableFileError,
@@ -25,27 +30,37 @@ from lagbench.errors import (
     format_count,
     suggest_name,
 )
+from lagbench.figures.tables import Table
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
 from lagbench.metrics.significance import compare as compare_scores
+from lagbench.metrics.table import CHOSEN
+from lagbench.references.shipped import shipped
 from lagbench.references.table import REFERENCES
 
 from .boards import find_board
 from .card import JSON_NAME, number_methods
 from .front import digits
-from .published_scores import (
-    PublishedScores,
-    parse_scores,
-    read_published_scores,
-    read_scores,
-)
 from .score import score
-from .score_file import NETCDF_NAME
-from .task import SUBMISSION
+from .score_file import NETCDF_NAME, SubmissionStatistics, read_statistics
+from .tables import (
+    ARROWS,
+    LEGEND,
+    break_name,
+    label_metric,
+    show_number,
+    with_interval,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
+
+CHANCE = "?"
+"""Mark of a difference that may be chance, behind better or worse."""
+
+TOO_FEW = "too few"
+"""What stands instead of better or worse where scenarios decide nothing."""
 
 SAME = ("split", "size", "dataset_sha256")
 """Fields in which two submissions must be equal."""
@@ -59,32 +74,19 @@ class Contestant:
     """One of the two methods of a comparison: the scores of its seeds."""
 
     name: str  # as the user gave it
-    seeds: tuple[PublishedScores, ...]
+    identity: Mapping[str, str]  # split, size, version and hash of the data, method
+    ranking: str  # name of the metric that ranks
+    predictions: frozenset[str]  # content hashes of the predicted positions
+    # scores of each seed by the metrics that all of them have, with nine digits
+    scores: Mapping[str, tuple[Score, ...]]
+    # the best reference, if any, and its scores in the ranking metric
+    best_reference: str | None
+    best_reference_score: Score
 
     @property
-    def identity(self) -> Mapping[str, str]:
-        """Split, size, version and hash of the data set, and the method."""
-        return self.seeds[0].identity
-
-    @property
-    def ranking(self) -> str:
-        """Name of the metric that ranks."""
-        return self.seeds[0].ranking
-
-    @property
-    def predictions(self) -> set[str]:
-        """Content hashes of the predicted positions."""
-        return {seed.predictions_sha256 for seed in self.seeds}
-
-    @property
-    def scores(self) -> dict[str, tuple[Score, ...]]:
-        """Scores of each seed, by the metrics that all of them have."""
-        rows = [seed.scores[SUBMISSION] for seed in self.seeds]
-        scores = {}
-        for name in rows[0]:
-            if all(name in row for row in rows):
-                scores[name] = tuple(row[name] for row in rows)
-        return scores
+    def seed_count(self) -> int:
+        """Number of seeds."""
+        return len(self.scores[self.ranking])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +133,6 @@ class ComparisonResult:
     is_against_reference: bool
     # the ranking one first; observables are left out
     metrics: Mapping[str, MetricComparison]
-    # of each method, over the classical side, by seed; "" in a scores.nc
-    speedups: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     def __repr__(self) -> str:
         """Return the two methods and the verdict; the values are too many."""
@@ -174,24 +174,12 @@ class ComparisonResult:
         """
         import pandas as pd
 
-        lines = []
-        for name, comparison in self.metrics.items():
-            low, high = comparison.test.interval
-            lines.append(
-                {
-                    "metric": name,
-                    "unit": comparison.metric.unit,
-                    "side": comparison.side,
-                    "first": comparison.first,
-                    "second": comparison.second,
-                    "difference": comparison.test.difference,
-                    "low": low,
-                    "high": high,
-                    "p": comparison.test.p,
-                    "significant": comparison.test.significant,
-                }
-            )
-        return pd.DataFrame(lines)
+        table = pd.DataFrame.from_dict(self.as_json()["metrics"], orient="index")
+        bounds = pd.DataFrame(table.pop("interval").tolist(), table.index, dtype=float)
+        table["low"] = bounds[0]
+        table["high"] = bounds[1]
+        table = table.drop(columns=["undefined", "scenarios"])
+        return table.rename_axis("metric").reset_index()
 
     def as_json(self) -> dict[str, Any]:
         """Return the comparison as plain values; undefined ones are None."""
@@ -240,13 +228,12 @@ def compare(
     Args:
         first: one of these:
 
-            - a scores.json or a scores.nc, or a folder that holds one;
+            - a scores.nc, a scores.json beside it, or their folder;
             - a folder whose folders hold the scores of each seed of a method;
             - an entry of the leaderboard, as in ``cavity/full/neuralmpm``;
             - a predictions.nc, which is scored first.
-        second: one of the same. Or a bare name: of a reference in the scores of the
-            first (a scores.nc holds only the best one), or of an entry for the same
-            data set.
+        second: one of the same. Or a bare name: of a reference predictor (of a local
+            split the best one), or of an entry for the same data set.
         metrics: one or more names of further metrics to compare. The ranking metric is
             always compared. By default all metrics whose direction tells better from
             worse.
@@ -271,36 +258,46 @@ def compare(
     def load(name: str | Path) -> Contestant:
         seeds = []
         for path in find_scores(name, board):
-            seed = _read_seed(path)
-            if seed is None:
-                card = score(
-                    path,
-                    split=expected_split,
-                    root=root,
-                    workers=workers,
-                    registry=registry,
-                    write=False,
-                )
-                # through JSON, so that its digits are those of a scores.json
-                seed = parse_scores(card.as_json())
+            try:
+                seed = read_statistics(path.resolve())
+            except UnreadableFileError:
+                # it may be predictions
+                with TemporaryDirectory() as scratch:
+                    card = score(
+                        path,
+                        split=expected_split,
+                        root=root,
+                        workers=workers,
+                        registry=registry,
+                        output_dir=scratch,
+                    )
+                    seed = read_statistics(card.files[1])
             seeds.append(seed)
-        contestant = Contestant(name=str(name), seeds=tuple(seeds))
-        _check_seeds(contestant, expected_split)
+        contestant = _unite(str(name), seeds)
+        found_split = contestant.identity["split"]
+        if expected_split not in (None, found_split):
+            raise UsageError(
+                f"the scores of {name} are of the split {found_split!a}, not of "
+                f"{expected_split}"
+            )
         return contestant
 
     is_bare = Path(second).name == str(second) and not Path(second).exists()
     if not is_bare or Path(second).suffix:
         find_scores(second, board)  # before the first is scored
     one = load(first)
-    is_reference = is_bare and str(second) in one.seeds[0].scores
+    references = {}
+    if is_bare:
+        references = _references_beside(one, registry)
+    is_reference = str(second) in references
     if is_reference:
-        reference = replace(
-            one.seeds[0],
+        two = replace(
+            one,
+            name=str(second),
             identity={**one.identity, "method": str(second)},
-            predictions_sha256="",
-            scores={SUBMISSION: one.seeds[0].scores[str(second)]},
+            predictions=frozenset(),
+            scores=references[str(second)],
         )
-        two = Contestant(name=str(second), seeds=(reference,))
     elif is_bare and not Path(second).suffix:
         two = load(f"{one.identity['split']}/{one.identity['size']}/{second}")
     else:
@@ -329,13 +326,9 @@ def compare(
         same_predictions=is_same,
         ranking=one.ranking,
         scenarios=len(comparisons[one.ranking].test.scenarios),
-        seeds=(len(one.seeds), len(two.seeds)),
+        seeds=(one.seed_count, two.seed_count),
         is_against_reference=is_reference,
         metrics=comparisons,
-        speedups=(
-            tuple(seed.speedup for seed in one.seeds),
-            () if is_reference else tuple(seed.speedup for seed in two.seeds),
-        ),
     )
 
 
@@ -356,15 +349,17 @@ def find_scores(source: str | Path, board: str | Path | None = None) -> list[Pat
         for folders in ([path], sorted(path.glob("*/"))):
             files = []
             for folder in folders:
-                own = [folder / JSON_NAME, folder / NETCDF_NAME]
-                files += [file for file in own if file.is_file()][:1]
+                if (folder / NETCDF_NAME).is_file():
+                    files.append(folder / NETCDF_NAME)
             if files:
                 return files
         raise UnreadableFileError(
-            f"{path} holds no {JSON_NAME} and no {NETCDF_NAME}; name the folder that "
-            "`lagbench score` wrote, or an entry as split/size/method"
+            f"{path} holds no {NETCDF_NAME}; name the folder that `lagbench score` "
+            "wrote, or an entry as split/size/method"
         )
     place = path.parts
+    if path.name == JSON_NAME:
+        path = path.with_name(NETCDF_NAME)  # it has the same scores
     if path.exists() or len(place) != 3 or path.suffix:
         check_regular(path)
         return [path]
@@ -386,46 +381,73 @@ def find_scores(source: str | Path, board: str | Path | None = None) -> list[Pat
     return files
 
 
-def _read_seed(path: Path) -> PublishedScores | None:
-    """Return the scores of a scores.json or scores.nc, None of other files."""
-    if path.suffix == ".json":
-        return read_scores(path)
-    try:
-        return read_published_scores(path.resolve())
-    except UnreadableFileError:
-        return None  # it may be predictions
+def _unite(name: str, seeds: Sequence[SubmissionStatistics]) -> Contestant:
+    """Return a method from its seeds.
 
-
-def _check_seeds(contestant: Contestant, expected_split: str | None) -> None:
-    """Refuse seeds of different methods, tasks or scenarios, and copies of one seed."""
-    first = contestant.seeds[0]
-    for seed in contestant.seeds:
-        if first.ranking not in seed.scores.get(SUBMISSION, {}):
-            raise UnreadableFileError(
-                f"the scores of {contestant.name} lack {first.ranking}, which ranks; "
-                "score the predictions again"
-            )
-        is_same_method = seed.identity["method"] == first.identity["method"]
-        scenarios = seed.scores[SUBMISSION][first.ranking].scenarios
-        if not is_same_method or (
-            scenarios != first.scores[SUBMISSION][first.ranking].scenarios
-        ):
-            raise UsageError(
-                f"{contestant.name} holds scores of several methods or subsets; keep "
-                "the seeds of each method in a folder of its own"
-            )
+    Seeds of different methods, tasks or scenarios, and copies of one are refused.
+    """
+    first = seeds[0]
+    rows = []
+    for seed in seeds:
         _check_same(first.identity, seed.identity)
-    if len(contestant.predictions) < len(contestant.seeds):
+        is_same_method = seed.identity["method"] == first.identity["method"]
+        if not is_same_method or seed.tallies.keys() != first.tallies.keys():
+            raise UsageError(
+                f"{name} holds scores of several methods or subsets; keep the seeds of "
+                "each method in a folder of its own"
+            )
+        row = {}
+        for metric, one in seed.scores().items():
+            values = [round_digits(value) for value in one.values.tolist()]
+            row[metric] = replace(one, values=np.array(values))
+        if first.ranking not in row:
+            raise UnreadableFileError(
+                f"the scores of {name} lack {first.ranking}, which ranks; score the "
+                "predictions again"
+            )
+        rows.append(row)
+    predictions = frozenset(seed.predictions_sha256 for seed in seeds)
+    if len(predictions) < len(seeds):
         raise UsageError(
-            f"{contestant.name} holds the same predictions twice; one file stands for "
-            "one training"
+            f"{name} holds the same predictions twice; one file stands for one training"
         )
-    split = first.identity["split"]
-    if expected_split is not None and split != expected_split:
-        raise UsageError(
-            f"the scores of {contestant.name} are of the split {split!a}, not of "
-            f"{expected_split}"
+    scores = {}
+    for metric in rows[0]:
+        if all(metric in row for row in rows):
+            scores[metric] = tuple(row[metric] for row in rows)
+    return Contestant(
+        name=name,
+        identity=first.identity,
+        ranking=first.ranking,
+        predictions=predictions,
+        scores=scores,
+        best_reference=first.best_reference,
+        best_reference_score=replace(
+            scores[first.ranking][0], values=first.best_reference_values
+        ),
+    )
+
+
+def _references_beside(
+    method: Contestant, registry: Registry | None
+) -> dict[str, dict[str, tuple[Score, ...]]]:
+    """Return the scores of references by name and metric: shipped, or the best one."""
+    references: dict[str, dict[str, tuple[Score, ...]]] = {}
+    if method.best_reference is not None:
+        references[method.best_reference] = {
+            method.ranking: (method.best_reference_score,)
+        }
+    with suppress(UsageError):
+        size = (registry or load()).size(
+            method.identity["split"], method.identity["size"]
         )
+        recorded = size.measured
+        if recorded and recorded.dataset_sha256 == method.identity["dataset_sha256"]:
+            for name, one in (shipped(size) or {}).items():
+                references[name] = {}
+                for metric, shipped_score in one.scores.items():
+                    references[name][metric] = (shipped_score,)
+    return references
 
 
 def _check_same(one: Mapping[str, str], two: Mapping[str, str]) -> None:
@@ -445,12 +467,10 @@ def _compare_metrics(
     """Compare the ranking metric, then others that judge and are asked for, by name."""
     if isinstance(metrics, str):
         metrics = (metrics,)
-    first_scores = one.scores
-    second_scores = two.scores
     judging = [
         name
-        for name, scores in first_scores.items()
-        if name in second_scores and scores[0].metric.direction is not Direction.NONE
+        for name, scores in one.scores.items()
+        if name in two.scores and scores[0].metric.direction is not Direction.NONE
     ]
     if one.ranking not in judging:
         raise UnreadableFileError(
@@ -467,8 +487,8 @@ def _compare_metrics(
     others = [name for name in judging if name in chosen and name != one.ranking]
     names = [one.ranking, *others]
 
-    of_one = first_scores[one.ranking][0].scenarios
-    of_two = second_scores[one.ranking][0].scenarios
+    of_one = one.scores[one.ranking][0].scenarios
+    of_two = two.scores[one.ranking][0].scenarios
     if set(of_one).isdisjoint(of_two):
         raise UsageError(
             f"{one.name} and {two.name} have no scenario in common: "
@@ -479,14 +499,84 @@ def _compare_metrics(
     for name in names:
         means = []
         undefined = []
-        for seeds in (first_scores[name], second_scores[name]):
+        for seeds in (one.scores[name], two.scores[name]):
             means.append(mean(mean_over_seeds([seed.values for seed in seeds])))
             undefined.append(sum(sum(seed.undefined) for seed in seeds))
         comparisons[name] = MetricComparison(
-            metric=first_scores[name][0].metric,
+            metric=one.scores[name][0].metric,
             first=means[0],
             second=means[1],
             undefined=(undefined[0], undefined[1]),
-            test=compare_scores(first_scores[name], second_scores[name]),
+            test=compare_scores(one.scores[name], two.scores[name]),
         )
     return comparisons
+
+
+def comparison_tables(
+    result: ComparisonResult, *, every: bool = False
+) -> Iterator[Table]:
+    """Yield which method is better, then means with their units.
+
+    The second column names the first method: it is better or worse than the second. The
+    difference is that of the loss: below 0 where the first method is better, also
+    where more of the metric is better. With ``every`` all metrics are shown, not only
+    the chosen ones.
+    """
+    differences = []
+    means = []
+    for comparison in _shown_metrics(result, every=every):
+        test = comparison.test
+        metric = comparison.metric
+        # no unit, so that four columns fit a terminal
+        differences.append(
+            (
+                f"{metric.name}{ARROWS[metric.direction]}",
+                _side(comparison),
+                with_interval(test.difference, test.interval),
+                "-" if math.isnan(test.p) else f"{test.p:.3g}",
+            )
+        )
+        cells = [label_metric(metric)]
+        both = (comparison.first, comparison.second)
+        for value, undefined in zip(both, comparison.undefined, strict=True):
+            mark = f" †{undefined}" if undefined else ""
+            cells.append(f"{show_number(value)}{mark}")
+        means.append(tuple(cells))
+    first = break_name(result.first)
+    title = f"{result.first} against {result.second} on {result.split} {result.size}"
+    heads = ("metric", f"{first}\nis", "loss difference [95 %]", "p")
+    yield Table(title, heads, tuple(differences))
+    yield Table("means", ("metric", first, break_name(result.second)), tuple(means))
+
+
+def comparison_lines(result: ComparisonResult, *, every: bool = False) -> Iterator[str]:
+    """Yield the lines below the tables, which explain the marks that these have."""
+    yield LEGEND
+    yield (
+        f"loss difference: {result.first} minus {result.second}; below 0 "
+        f"{result.first} is better"
+    )
+    shown = _shown_metrics(result, every=every)
+    if any(any(comparison.undefined) for comparison in shown):
+        yield "†: so many frames without a value"
+    sides = [_side(comparison) for comparison in shown]
+    if any(side.endswith(CHANCE) for side in sides):
+        yield f"{CHANCE}: the test finds no difference at 5 %"
+    if TOO_FEW in sides:
+        yield f"{TOO_FEW}: under {FEWEST_SCENARIOS} scenarios nothing is decided"
+
+
+def _shown_metrics(result: ComparisonResult, *, every: bool) -> list[MetricComparison]:
+    """Return the metrics of the tables: the chosen ones, or all."""
+    chosen = (result.ranking, *CHOSEN)
+    return [one for name, one in result.metrics.items() if every or name in chosen]
+
+
+def _side(comparison: MetricComparison) -> str:
+    """Return whether the first method is better, and whether that may be chance."""
+    side = comparison.side
+    if side not in ("better", "worse"):
+        return side
+    if len(comparison.test.scenarios) < FEWEST_SCENARIOS:
+        return TOO_FEW
+    return side if comparison.test.significant else f"{side}{CHANCE}"

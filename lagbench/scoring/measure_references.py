@@ -1,14 +1,13 @@
-"""Measure the reference predictors of data sets and write the scores that are shipped.
+"""Measure the reference predictors of a data set and write the scores that are shipped.
 
-usage: python -m lagbench.scoring.measure_references [--split cavity] [--size mini]
+usage: python -m lagbench.scoring.measure_references --split cavity --size mini
            [--subset shift] [--root FOLDER] [--workers 2] [--predictor analog ...]
            [--costs]
 
-All splits and sizes whose data are there are measured on test, or those named, or on
-another subset, which then must be there. With --predictor only these references are
-measured anew; the others, and all costs, stay as they are. Last a frame of each
-reference and of the solver itself (``lagbench bench``) is timed on one core; with
---costs nothing else is done. ``git diff`` then shows which shipped scores have changed.
+With --predictor only these references are measured anew; the others, and all costs,
+stay as they are. Last a frame of each reference and of the solver itself (``lagbench
+bench``) is timed on one core; with --costs nothing else is done. ``git diff`` then
+shows which shipped scores have changed.
 """
 
 from __future__ import annotations
@@ -17,84 +16,98 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from lagbench.data.limits import SCORED_SUBSETS
 from lagbench.data.local import resolve_root
-from lagbench.data.registry import Size
+from lagbench.data.registry import Size, load
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
+from lagbench.metrics.aggregate import aggregate
+from lagbench.metrics.table import METRICS, select
+from lagbench.references.predictor import given_in
 from lagbench.references.shipped import (
-    FOLDER,
-    shipped_path,
+    ReferenceScores,
+    correlation_of,
     write_costs,
     write_shipped,
 )
 from lagbench.references.table import REFERENCES, references_of
+from lagbench.work.run import Meter, Progress
 
-from .references import measure, sizes_with_test_files, time_references
-from .task import load_scored_task
+from .scenarios import score_scenarios, time_frames
+from .score import check_train
+from .task import load_scored_task, predict_reference
+
+TIMED_SCENARIOS = 2
+"""Test scenarios on which the references are timed."""
 
 
-def measure_and_ship(
+def measure(
     size: Size,
     root: Path,
     *,
-    workers: int = 1,
-    folder: Path = FOLDER,
     names: Collection[str] | None = None,
-) -> Path:
-    """Measure references of a data set and write them to the folder of shipped scores.
+    workers: int = 1,
+    progress: Callable[[Progress], None] | None = None,
+) -> dict[str, ReferenceScores]:
+    """Return the scores of references of a data set by name.
+
+    The scored subset must be there, and train for those that look things up there; the
+    values of both are hashed and compared with the recorded hashes.
 
     Args:
-        size: the split and size.
+        size: the split and size, and the subset that it scores.
         root: folder of all data sets.
-        workers: worker processes.
-        folder: folder of shipped scores.
         names: names of the references; by default all.
-
-    Raises:
-        DataError: the data set is not recorded in datasets.yaml, or its files are
-            missing.
-        UsageError: the data set has none of these references.
+        workers: worker processes.
+        progress: called with the state of the work.
     """
-    where = f"{size.split} {size.name}"
-    if names is not None:
-        names_here = {reference.name for reference in references_of(size)}
-        if names_here.isdisjoint(names):
-            raise UsageError(f"none of its references: {', '.join(names)}", where=where)
-    if size.measured is None:
-        raise DataError("the data set has no recorded hash", where=where)
-
-    config = load_scored_task(size, root).config
-    reported = config.slow_frames.intersection(config.predicted_frames)
-    scores = measure(size, root, names=names, workers=workers)
-    return write_shipped(
-        size,
-        scores,
-        dataset_sha256=size.measured.dataset_sha256,
-        reported=sorted(reported),
-        folder=folder,
-        partial=names is not None,
+    task = load_scored_task(size, root)
+    metrics = select(known=METRICS)
+    references = tuple(
+        one.name for one in references_of(size) if names is None or one.name in names
+    )
+    check_train(size, root, references)
+    outcomes = score_scenarios(
+        task,
+        metrics=metrics,
+        references=references,
+        workers=workers,
+        meter=Meter(progress),
     )
 
-
-def time_all(size: Size, root: Path, *, folder: Path = FOLDER) -> Path:
-    """Time a frame of each reference and of the solver; write what they cost.
-
-    Raises:
-        WorkFailedError: the solver fails.
-    """
-    options = ["--split", size.split, "--size", size.name, "--json"]
-    command = [sys.executable, "-m", "lagbench", "bench", *options]
-    process = subprocess.run(command, capture_output=True, text=True, check=False)
-    if process.returncode != 0:
-        raise WorkFailedError(
-            f"the solver could not be timed: {process.stderr.strip()[-300:]}"
+    measured = {}
+    for name in references:
+        tallies = {one.scenario: one.tallies[name] for one in outcomes}
+        scores = aggregate(metrics, tallies)
+        medians = [np.median(one.seconds[name]) for one in outcomes]
+        measured[name] = ReferenceScores(
+            name=name,
+            scores=scores,
+            seconds_per_frame=float(np.median(medians)),
+            correlation=correlation_of(scores),
         )
-    solver = json.loads(process.stdout)["seconds_per_frame"]
-    seconds = time_references(size, root)
-    return write_costs(size, seconds, solver=solver, folder=folder)
+    return measured
+
+
+def time_references(size: Size, root: Path) -> dict[str, float]:
+    """Return the processor time of a frame by name of the reference [s].
+
+    The median over the frames of the first test scenarios, one core, no scoring.
+    """
+    task = load_scored_task(size, root)
+    seconds: dict[str, list[float]] = {}
+    for scenario in task.scenarios[:TIMED_SCENARIOS]:
+        with task.opened(scenario) as truth:
+            given = given_in(truth.file, size, root)
+        for reference in references_of(size):
+            times = seconds.setdefault(reference.name, [])
+            for _ in time_frames(predict_reference(reference, given), times):
+                pass
+    return {name: float(np.median(times)) for name, times in seconds.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,8 +115,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--split")
-    parser.add_argument("--size")
+    parser.add_argument("--split", required=True)
+    parser.add_argument("--size", required=True)
     parser.add_argument("--subset", default="test", choices=SCORED_SUBSETS)
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
@@ -113,21 +126,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     root = resolve_root(options.root)
+    names = options.predictor
+    where = f"{options.split} {options.size}"
     try:
-        for any_size in sizes_with_test_files(
-            root, split=options.split, name=options.size
-        ):
-            size = any_size.scored_on(options.subset)
-            if not options.costs:
-                measure_and_ship(
-                    size, root, workers=options.workers, names=options.predictor
+        size = load().size(options.split, options.size).scored_on(options.subset)
+        names_here = {reference.name for reference in references_of(size)}
+        if names and names_here.isdisjoint(names):
+            raise UsageError(f"none of its references: {', '.join(names)}", where=where)
+        if size.measured is None:
+            raise DataError("the data set has no recorded hash", where=where)
+        if not options.costs:
+            config = load_scored_task(size, root).config
+            reported = config.slow_frames.intersection(config.predicted_frames)
+            path = write_shipped(
+                size,
+                measure(size, root, names=names, workers=options.workers),
+                dataset_sha256=size.measured.dataset_sha256,
+                reported=sorted(reported),
+                partial=names is not None,
+            )
+        if not names:
+            bench = ["bench", "--split", size.split, "--size", size.name, "--json"]
+            process = subprocess.run(
+                [sys.executable, "-m", "lagbench", *bench],
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            if process.returncode != 0:
+                raise WorkFailedError(
+                    f"the solver could not be timed: {process.stderr.strip()[-300:]}"
                 )
-            if not options.predictor:
-                time_all(size, root)
-            path = shipped_path(size)
-            length = path.stat().st_size
-            sys.stdout.write(f"{size.split} {size.name}: {path.name}, {length} bytes\n")
-            sys.stdout.flush()
+            solver = json.loads(process.stdout)["seconds_per_frame"]
+            path = write_costs(size, time_references(size, root), solver=solver)
+        sys.stdout.write(f"{where}: {path.name}, {path.stat().st_size} bytes\n")
     except LagbenchError as error:
         sys.stderr.write(f"measure_references: {error}\n")
         return error.exit_code

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +13,14 @@ from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.layout import expand_home
 from lagbench.data.local import (
     DESCRIPTION,
+    check_contents,
     load_rooted_registry,
     locate_split,
     resolve_root,
 )
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import LagbenchError, UsageError, check_installed, suggest_name
+from lagbench.errors import UsageError, check_installed, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
-from lagbench.metrics.frame import snapshots
-from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import (
     METRICS,
     OwnMetrics,
@@ -33,19 +30,17 @@ from lagbench.metrics.table import (
     select,
 )
 from lagbench.references.extrapolation import PERSISTENCE
-from lagbench.references.predictor import given_in
 from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
-from lagbench.references.table import NAIVE, REFERENCES
-from lagbench.submission.format import FileInfo, Header
+from lagbench.references.table import NAIVE, REFERENCES, references_of
+from lagbench.store.copy import update_working_copy
+from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import require_split, validate
-from lagbench.work.executor import Report
-from lagbench.work.machine import available_cores, worker_count
-from lagbench.work.run import Meter, Progress, run_all
+from lagbench.work.run import Meter, Progress
 
 from .card import JSON_NAME, ScoreCard, format_scores
-from .flags import Trace, judge_copying, judge_physics, judge_predictability
+from .flags import judge_copying, judge_physics, judge_predictability
 from .front import (
     NoSpeedup,
     Speedup,
@@ -53,20 +48,11 @@ from .front import (
     front_row,
     seconds_where_measured,
 )
-from .references import check_train, measurable
+from .scenarios import score_scenarios
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME, write_statistics
 from .skill import compute_skill
-from .task import (
-    SUBMISSION,
-    ScoredTask,
-    load_scored_task,
-    measure_rows,
-    predict_reference,
-)
-
-WORTH_WORKERS = 1_000_000
-"""Least particles times predicted frames for which worker processes are worth it."""
+from .task import SUBMISSION, ScoredTask, load_scored_task
 
 
 def score(
@@ -162,8 +148,6 @@ def score(
     result.check()
     with open_predictions(path) as opened:
         header = opened.header
-        info = opened.info
-        sha256 = result.sha256 or opened.content_sha256()
     if write:
         check_writable(folder, option="--output")
         _check_overwriting(folder / JSON_NAME, header)
@@ -179,9 +163,8 @@ def score(
         check_train(size, data_root, references)
     outcomes = score_scenarios(
         task,
-        path,
-        info,
         metrics=measured_metrics,
+        predictions=path,
         references=references,
         workers=workers,
         scheduler=scheduler,
@@ -209,7 +192,7 @@ def score(
     traces = [outcome.trace for outcome in outcomes]
     card = ScoreCard(
         header=header,
-        predictions_sha256=sha256,
+        predictions_sha256=str(result.sha256),
         config=task.config,
         ranking=ranking,
         tallies=tallies,
@@ -231,6 +214,32 @@ def score(
         temporary.write_bytes(format_scores(card))
         write_statistics(card, folder / NETCDF_NAME)
     return replace(card, files=(json_path, folder / NETCDF_NAME))
+
+
+def measurable(size: Size, root: Path) -> tuple[str, ...]:
+    """Return the names of the references that scoring measures where none are shipped.
+
+    These are the ones that count.
+    """
+    train = size.subsets.get("train", ())
+    has_train = bool(train) and all(size.path(root, i).is_file() for i in train)
+    names = []
+    for reference in references_of(size):
+        if reference.counts and (has_train or not reference.reads_train):
+            names.append(reference.name)
+    return tuple(names)
+
+
+def check_train(size: Size, root: Path, references: Collection[str]) -> None:
+    """Fetch and hash train where a reference looks things up there.
+
+    Raises:
+        DataError: a scenario of train is not the recorded one.
+    """
+    if any(REFERENCES[name].reads_train for name in references):
+        scenarios = size.subsets["train"]
+        update_working_copy(size, root, scenarios)
+        check_contents(size, root, scenarios)
 
 
 def speedup_beside(
@@ -349,102 +358,3 @@ def check_extras(extras: Collection[str]) -> None:
             )
         for module in sorted(modules[extra]):
             check_installed(module, extra=extra)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScenarioJob:
-    """Input of a worker that scores one scenario."""
-
-    task: ScoredTask  # the test subset
-    scenario: int  # id of the scenario
-    predictions: Path  # a predictions.nc that has been validated
-    info: FileInfo  # content of its headers
-    metrics: tuple[Metric, ...]
-    references: tuple[str, ...] = ()  # names of the references to measure beside it
-
-
-@dataclass(frozen=True, eq=False)
-class ScenarioScores:
-    """Result of a worker that scores one scenario."""
-
-    scenario: int  # id of the scenario
-    tallies: Mapping[str, Tally]  # statistics by row
-    trace: Trace  # of the submission's error
-
-
-def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
-    """Score one scenario of a submission and of the references beside it."""
-    number = job.scenario
-    try:
-        with (
-            job.task.opened(number) as truth,
-            open_predictions(job.predictions, info=job.info) as predictions,
-            ExitStack() as open_rows,
-        ):
-            scenario = truth.scenario
-            blocks = (block for _, block in predictions.blocks(number))
-            frames = itertools.chain.from_iterable(blocks)
-            rows = {SUBMISSION: snapshots(scenario, frames)}
-            for name in job.references:
-                given = given_in(truth.file, job.task.size, job.task.truth.root)
-                prediction = predict_reference(REFERENCES[name], given)
-                # where a metric fails, the traceback would keep the files open
-                if isinstance(prediction, Generator):
-                    open_rows.callback(prediction.close)
-                rows[name] = snapshots(scenario, prediction)
-            tallies, trace = measure_rows(
-                scenario, truth.snapshots(), rows, metrics=job.metrics, report=report
-            )
-    except LagbenchError as error:
-        error.add_note(f"scenario {number}")
-        raise
-    return ScenarioScores(number, tallies, trace)
-
-
-def score_scenarios(
-    task: ScoredTask,
-    path: Path,
-    info: FileInfo,
-    *,
-    metrics: tuple[Metric, ...],
-    references: tuple[str, ...],
-    workers: int | None,
-    scheduler: str | None,
-    meter: Meter,
-) -> list[ScenarioScores]:
-    """Return the statistics of every scenario, by ascending id.
-
-    Args:
-        task: the test subset.
-        path: a predictions.nc that has been validated.
-        info: content of its headers.
-        metrics: the metrics to measure.
-        references: names of the references to measure beside it.
-        workers: worker processes; None: one per core where the work is worth it.
-        scheduler: address of a Dask scheduler that takes the scenarios instead.
-        meter: counts the frames.
-    """
-    scenarios = task.scenarios
-    jobs = {}
-    for scenario in scenarios:
-        jobs[f"scenario {scenario}"] = ScenarioJob(
-            task=task,
-            scenario=scenario,
-            predictions=path,
-            info=info,
-            metrics=metrics,
-            references=references,
-        )
-
-    frame_count = len(scenarios) * task.config.horizon
-    default = 1
-    if frame_count * task.size.particles >= WORTH_WORKERS:
-        default = available_cores()
-    meter.begin("scoring", total=frame_count, scenarios=len(scenarios))
-    return run_all(
-        score_scenario,
-        jobs,
-        workers=worker_count(workers, default=default),
-        scheduler=scheduler,
-        report=meter.count,
-    )

@@ -195,16 +195,6 @@ def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -
     Raises:
         WorkFailedError: the file cannot be written.
     """
-    with atomic_path(path, option=option) as temporary:
-        try:
-            # closing the file writes most of it
-            with open_netcdf(temporary, "w") as file:
-                _write_card(file, card)
-        except (OSError, RuntimeError) as error:
-            raise explain_write_error(path, error, option=option) from error
-
-
-def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     tallies = [card.tallies[SUBMISSION][scenario] for scenario in card.scenarios]
     names = tallies[0].names
     attributes: dict[str, Any] = {"lagbench_scores": FORMAT}
@@ -215,7 +205,6 @@ def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     attributes["predictions_sha256"] = card.predictions_sha256
     attributes["ranking_metric"] = card.ranking
     attributes["statistics"] = " ".join(names)
-    file.setncatts(attributes)
 
     dims = ("statistic", "scenario", "frame")
     values = np.stack([tally.values for tally in tallies], axis=1)
@@ -229,22 +218,30 @@ def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     }
     if card.skill is not None:
         reference = card.skill.reference
-        file.best_floor = reference
+        attributes["best_floor"] = reference
         reference_values = card.scores[reference][card.ranking].values
         variables["best_floor_value"] = (("scenario",), reference_values)
-    for dim, length in lengths:
-        file.createDimension(dim, length)
-    for name, (variable_dims, array) in variables.items():
-        is_large = array.nbytes > INDEX
-        variable = file.createVariable(
-            name,
-            array.dtype,
-            variable_dims,
-            compression="zlib" if is_large else None,
-            complevel=9,
-            shuffle=True,
-            fill_value=False,
-            chunksizes=array.shape if is_large else None,
-            contiguous=not is_large,
-        )
-        variable[...] = array
+
+    with atomic_path(path, option=option) as temporary:
+        try:
+            # closing the file writes most of it
+            with open_netcdf(temporary, "w") as file:
+                file.setncatts(attributes)
+                for dim, length in lengths:
+                    file.createDimension(dim, length)
+                for name, (variable_dims, array) in variables.items():
+                    is_large = array.nbytes > INDEX
+                    variable = file.createVariable(
+                        name,
+                        array.dtype,
+                        variable_dims,
+                        compression="zlib" if is_large else None,
+                        complevel=9,
+                        shuffle=True,
+                        fill_value=False,
+                        chunksizes=array.shape if is_large else None,
+                        contiguous=not is_large,
+                    )
+                    variable[...] = array
+        except (OSError, RuntimeError) as error:
+            raise explain_write_error(path, error, option=option) from error

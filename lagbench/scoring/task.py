@@ -100,6 +100,16 @@ class ScoredTask:
                 scored = np.flatnonzero(material != WALL)
                 material = material[scored]
             mass = file.read_particle_mass()
+            stated = file.header.parameters.get("active_frames")
+            active_frames = None
+            if isinstance(stated, int | np.integer) and stated >= 0:
+                active_frames = int(stated)
+            elif stated is not None:
+                raise DataError(
+                    f"active_frames is {stated!r:.40}, no number of frames; make the "
+                    "data again",
+                    where=str(file.path),
+                )
             input_frames = slice(0, self.config.input_frames)
             given = file.read("position", input_frames)
             properties = Scenario(
@@ -109,7 +119,7 @@ class ScoredTask:
                 particle_mass=mass,
                 area=mass * len(material) / self.density,
                 scored=scored,
-                active_frames=_active_frames(file),
+                active_frames=active_frames,
             )
             yield OpenScenario(properties, file)
 
@@ -193,19 +203,6 @@ def load_scored_task(
         config=config,
         density=float(size.value("density")),
         predictability_limit=limit,
-    )
-
-
-def _active_frames(file: ScenarioFile) -> int | None:
-    """Return the predicted frames until the truth rests, None if not stated."""
-    stated = file.header.parameters.get("active_frames")
-    if stated is None:
-        return None
-    if isinstance(stated, int | np.integer) and stated >= 0:
-        return int(stated)
-    raise DataError(
-        f"active_frames is {stated!r:.40}, no number of frames; make the data again",
-        where=str(file.path),
     )
 
 

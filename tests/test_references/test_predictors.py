@@ -56,7 +56,7 @@ from lagbench.references.train_library import (
     mirrors_of,
     state_library,
 )
-from lagbench.scoring.references import measurable
+from lagbench.scoring.score import measurable
 from lagbench.scoring.skill import best_reference
 from lagbench.scoring.task import SUBMISSION
 

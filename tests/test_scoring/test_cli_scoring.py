@@ -14,7 +14,7 @@ from command_line import Result
 from conftest import SIZE, SPLIT
 
 from lagbench.make.generate import GenerationResult
-from lagbench.scoring import score
+from lagbench.scoring import scenarios
 
 Run = Callable[..., Result]
 
@@ -71,17 +71,6 @@ def test_a_template_replaces_predictions_only_on_request(
     assert run("validate", predictions).exit_code == 0
 
 
-def test_scores_are_called_as_their_predictions(run: Run, predictions: Path) -> None:
-    """Scores of gns.nc lie in gns/; a file without suffix keeps its place."""
-    for name, folder in (("gns.nc", "gns"), ("gat", "gat-scores")):
-        other = predictions.with_name(name)
-        shutil.copy(predictions, other)
-        result = run("score", other)
-        assert result.exit_code == 0, result.stderr
-        assert (predictions.parent / folder / "scores.nc").is_file()
-        assert other.is_file()
-
-
 @pytest.mark.parametrize("damage", ["truncated", "missing"])
 def test_score_and_validate_agree_on_unreadable_files(
     run: Run, predictions: Path, damage: str
@@ -106,11 +95,6 @@ def test_names_are_no_markup(run: Run, predictions: Path, method: str) -> None:
     scored = run("score", predictions)
     assert scored.exit_code == 0, scored.stderr
     assert f"{method} on {SPLIT}" in scored.stdout
-    compared = run("compare", predictions.parent, "persistence")
-    assert compared.exit_code == 0, compared.stderr
-    named = [line for line in compared.stdout.splitlines() if method in line]
-    assert named[0].startswith(f"{method} against persistence")
-    assert any(line.split()[0] == "metric" for line in named)
 
 
 @pytest.fixture
@@ -144,22 +128,8 @@ def test_an_unusable_folder_is_an_error_before_the_work(
     run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
     """A file is in the place of the folder."""
-    monkeypatch.setattr(score, "run_all", None)
+    monkeypatch.setattr(scenarios, "run_all", None)
     file = predictions.parent / "taken"
     file.write_text("")
     result = run("score", predictions, option, file)
     assert result.exit_code == 5
-
-
-@pytest.mark.parametrize("method", ["\x1b[31mred", "x" * 201])
-def test_foreign_text_does_not_reach_the_terminal(
-    run: Run, predictions: Path, method: str
-) -> None:
-    """Control characters or endless text make a scores.json unreadable."""
-    run("score", predictions, "--quiet")
-    path = predictions.with_suffix("") / "scores.json"
-    content = json.loads(path.read_text()) | {"method": method}
-    path.write_text(json.dumps(content))
-    result = run("compare", path, "persistence")
-    assert result.exit_code == 3
-    assert "\x1b" not in result.output

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import numpy as np
 import pytest
-from score_bench import ScoreBench, half_right, still, straight
+from score_bench import ScoreBench, still, straight
 
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.data.registry import load
+from lagbench.errors import DataError, UsageError
 from lagbench.metrics import differ
-from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.compare import compare
-from lagbench.scoring.tables import (
-    card_tables,
-    comparison_lines,
-    comparison_tables,
-)
+from lagbench.references import shipped
+from lagbench.scoring.compare import compare, comparison_tables
 
 Folders = dict[str, Path]
 
@@ -45,52 +41,46 @@ def scored(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> Folde
     return folders
 
 
-def rows_of(values: Sequence[object], undefined: Any = None) -> dict[str, Any]:
-    """Return the rows of a scores.json with one metric."""
-    if undefined is None:
-        undefined = [0] * len(values)
-    metric = {"values": values, "undefined": undefined}
-    return {"submission": {"mse_avg": metric}}
-
-
 def publish(folder: Path, values: list[float], *, method: str, **changes: Any) -> Path:
-    """Write a scores.json of one metric with these values per scenario."""
-    scenarios = list(range(len(values)))
+    """Write a scores.nc of one metric with these values per scenario."""
     content = {
-        "lagbench_scores": 1,
         "split": "cavity",
         "size": "full",
         "dataset_version": "1.0.0",
         "dataset_sha256": "0" * 64,
         "method": method,
         "predictions_sha256": method,
-        "task": {"scenarios": scenarios},
         "ranking_metric": "mse_avg",
-        "rows": rows_of(values),
-    }
-    path = folder / method / "scores.json"
+        "ids": range(len(values)),
+    } | changes
+    path = folder / method / "scores.nc"
     path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(content | changes))
+    dims = ("statistic", "scenario", "frame")
+    with netCDF4.Dataset(path, "w") as file:
+        file.lagbench_scores = 1
+        file.statistics = "attribute_mse"
+        for dim, length in zip(dims, (1, len(values), 1), strict=True):
+            file.createDimension(dim, length)
+        file.createVariable("scenario", "i4", dims[1:2])[:] = content.pop("ids")
+        file.createVariable("frame", "i4", dims[2:])[:] = 1
+        file.createVariable("value", "f8", dims)[:] = np.reshape(values, (1, -1, 1))
+        file.createVariable("measured", "i1", dims)[:] = 1
+        file.setncatts(content)
     return path
 
 
-def publish_seeds(
-    folder: Path,
-    rows: Iterable[Iterable[float]],
-    method: str,
-    **changes: Any,
-) -> Path:
+def publish_seeds(folder: Path, rows: Iterable[Iterable[float]], method: str) -> Path:
     """Write a folder of the seeds of a method and return it."""
     for seed, values in enumerate(rows):
-        own_hash = {"predictions_sha256": f"{method}{seed}"}
-        seed_folder = folder / str(seed)
+        own_hash = f"{method}{seed}"
         path = publish(
-            seed_folder,
+            folder / "raw" / str(seed),
             list(values),
             method=method,
-            **(own_hash | changes),
+            predictions_sha256=own_hash,
         )
-        path.rename(seed_folder / "scores.json")
+        (folder / own_hash).mkdir()
+        path.rename(folder / own_hash / path.name)
     return folder
 
 
@@ -141,7 +131,7 @@ def test_a_folder_of_seeds_is_a_method(tmp_path: Path) -> None:
     assert "weights" in compare(a_folder, one_seed).verdict
 
 
-OTHER_IDS = {"task": {"scenarios": list(range(100, 106))}}
+OTHER_IDS = {"ids": range(100, 106)}
 UNLIKE: list[tuple[dict[str, Any], type[Exception]]] = [
     ({"split": "fluid"}, UsageError),
     ({"size": "mini"}, UsageError),
@@ -174,11 +164,30 @@ def test_what_is_no_seed_of_a_method_is_refused(
     """On either side."""
     other = publish(tmp_path, TWOS, method="other")
     seeds = publish_seeds(tmp_path / "seeds", [ONES], "a")
-    path = publish(seeds, ONES, method="a")
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    publish(seeds, ONES, **({"method": "a"} | changes))
     for pair in ((seeds, other), (other, seeds)):
         with pytest.raises(UsageError):
             compare(*pair)
+
+
+def test_shipped_references_stand_beside_scores_of_our_splits(tmp_path: Path) -> None:
+    """A submission with the values of a reference is as good as the reference."""
+    size = load().size("cavity", "mini")
+    references = shipped(size)
+    assert references is not None
+    assert size.measured is not None
+    values = references["persistence"].scores["mse_avg"].values.tolist()
+    path = publish(
+        tmp_path,
+        values,
+        method="still",
+        size="mini",
+        dataset_sha256=size.measured.dataset_sha256,
+        ids=size.subsets["test"],
+    )
+    result = compare(path, "persistence")
+    assert result.metrics["mse_avg"].side == "same"
+    assert result.second == "persistence"
 
 
 @pytest.mark.slow
@@ -250,79 +259,6 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
         compare(f"{name}s", "persistence", board=entries)
 
 
-WORSE_AND_BETTER = [0.5, 1.5, 1.5, 1.5, 1.5, 1.5]
-
-
-def side_of(first: Path, second: Path) -> str:
-    """Return what the table says of the first method beside the second."""
-    result = compare(first, second)
-    table, *_ = comparison_tables(result)
-    column = table.columns.index(f"{result.first}\nis")
-    return table.rows[0][column]
-
-
-def test_a_column_says_which_method_is_better(tmp_path: Path) -> None:
-    """A difference that may be chance has a question mark."""
-    a = publish(tmp_path, ONES, method="a")
-    b = publish(tmp_path, TWOS, method="b")
-    c = publish(tmp_path, WORSE_AND_BETTER, method="c")
-    assert side_of(a, b) == "better"
-    assert side_of(b, a) == "worse"
-    assert side_of(a, c) == "better?"
-    d = publish(tmp_path, ONES, method="d")
-    assert side_of(a, d) == "same"
-
-
-def test_rounding_makes_no_method_better(tmp_path: Path) -> None:
-    """Sums in another order differ in the last digits, in all scenarios alike."""
-    a = publish(tmp_path, ONES, method="a")
-    b = publish(tmp_path, [1.0 - 1e-13] * 6, method="b")
-    assert side_of(a, b) == "same"
-    result = compare(a, b)
-    assert result.metrics["mse_avg"].test.difference == 0.0
-    assert "no difference" in result.verdict
-    c = publish(tmp_path, [1.0 - 1e-9] * 6, method="c")
-    assert side_of(a, c) == "worse"
-
-
-def test_few_scenarios_decide_nothing(tmp_path: Path) -> None:
-    """Five scenarios cannot reach 5 %: neither column nor verdict claims anything."""
-    a = publish(tmp_path, ONES[:5], method="a")
-    b = publish(tmp_path, TWOS[:5], method="b")
-    assert side_of(a, b) == "too few"
-    result = compare(a, b)
-    assert result.verdict.startswith("5 scenarios decide nothing")
-    # scenarios in which both have equal values are the same, however few
-    c = publish(tmp_path, ONES[:5], method="c")
-    assert side_of(a, c) == "same"
-
-
-def test_the_speedups_of_both_are_shown(tmp_path: Path) -> None:
-    """Or the reason why there is none."""
-    speedup = {
-        "value": 2.5,
-        "interval": [1.5, 4.0],
-        "at_least": True,
-        "classical_seconds": 0.1,
-    }
-    one = publish(tmp_path, ONES, method="one", speedup=speedup)
-    two = publish(tmp_path, TWOS, method="two", why_no_speedup="no cost")
-    result = compare(one, two)
-    assert result.speedups == (("> 2.5 [1.5, 4]",), ("no cost",))
-    assert "speedup of one: > 2.5 [1.5, 4]" in list(comparison_lines(result))
-
-
-def test_a_reference_is_as_good_as_its_submission(scored: Folders) -> None:
-    """A reference's name compares with the row beside the submission."""
-    folder = scored["still"]
-    other = scored["straight"]
-    by_name = compare(folder, "constant-velocity").as_json()
-    by_file = compare(folder, other).as_json()
-    assert by_name["metrics"] == by_file["metrics"]
-    assert by_name["second"] == "constant-velocity"
-    assert by_file["second"] == "straight"
-
-
 def test_two_submissions_of_one_method_are_numbered(tmp_path: Path) -> None:
     a = publish(
         tmp_path / "a",
@@ -345,88 +281,25 @@ def test_two_submissions_of_one_method_are_numbered(tmp_path: Path) -> None:
     assert means.columns[1:] == ("toy (1)", "toy (2)")
 
 
-INFINITE = float("inf")
-
-
-def first_value(value: object) -> dict[str, Any]:
-    """Return changes after which the value of the first scenario is another."""
-    return {"rows": rows_of([value, *ONES[1:]])}
-
-
-def scenario_ids(*ids: object) -> dict[str, Any]:
-    """Return changes after which the scenarios have other ids."""
-    return {"task": {"scenarios": list(ids)}}
-
-
-ENERGY = {"values": ONES, "undefined": [0] * 6}
-MALFORMED: dict[str, dict[str, Any]] = {
-    "an infinite value": first_value(INFINITE),
-    "ids that descend": scenario_ids(5, 4, 3, 2, 1, 0),
-    "no scenarios": {"task": {"scenarios": []}, "rows": rows_of([])},
-    "fewer ids than values": scenario_ids(3),
-    "an observable that ranks": {
-        "ranking_metric": "energy_true",
-        "rows": {"submission": {"energy_true": ENERGY}},
-    },
-    "a name that is no text": {"method": 5},
-    "rows in a list": {"rows": [1]},
-    "no rows": {"rows": []},
-    "a layout of its own": {"lagbench_scores": 2},
-}
-
-
-@pytest.mark.parametrize("changes", MALFORMED.values(), ids=MALFORMED)
-def test_malformed_scores_are_unreadable(
-    tmp_path: Path, changes: dict[str, Any]
+@pytest.mark.parametrize(
+    ("first", "second", "side"),
+    [
+        (ONES, TWOS, "better"),
+        (TWOS, ONES, "worse"),
+        (ONES, [0.5, 1.5, 1.5, 1.5, 1.5, 1.5], "better?"),  # it may be chance
+        (ONES, ONES, "same"),
+        # sums in another order differ in the last digits, in all scenarios alike
+        (ONES, [1.0 - 1e-13] * 6, "same"),
+        ([1.0 - 1e-9] * 6, ONES, "better"),
+        # five scenarios cannot reach 5 %
+        (ONES[:5], TWOS[:5], "too few"),
+        (ONES[:5], ONES[:5], "same"),
+    ],
+)
+def test_a_column_says_which_method_is_better(
+    tmp_path: Path, first: list[float], second: list[float], side: str
 ) -> None:
-    """On either side of the comparison."""
-    good = publish(tmp_path, ONES, method="good")
-    bad = publish(tmp_path, ONES, method="bad")
-    content = json.loads(bad.read_text())
-    bad.write_text(json.dumps(content | changes))
-    with pytest.raises(UnreadableFileError):
-        compare(good, bad)
-    with pytest.raises(UnreadableFileError):
-        compare(bad, good)
-
-
-def test_rows_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
-    path = publish(tmp_path, [1.0], method="a", ranking_metric="vorticity_rmse")
-    other = publish(tmp_path, TWOS, method="b")
-    with pytest.raises(UnreadableFileError):
-        compare(path, other)
-
-
-@pytest.fixture(scope="module")
-def half_right_card(
-    bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory
-) -> ScoreCard:
-    """The scores of a method that is right in half of the frames."""
-    folder = tmp_path_factory.mktemp("half-right")
-    path = bench.submit(folder / "predictions.nc", half_right)
-    return bench.evaluate(path)
-
-
-def row_name(row: Sequence[str]) -> str:
-    """Return the name of the metric that a row begins with."""
-    name, *_ = row[0].split()
-    return name
-
-
-def test_tables_show_references_undefined_frames_and_units(
-    half_right_card: ScoreCard,
-) -> None:
-    card = half_right_card
-    horizon, at_frames, per_scenario = card_tables(card)
-    rows = {row_name(row): row for row in horizon.rows}
-    first_names = list(rows)[:2]
-    assert first_names == ["skill", card.ranking]
-    (reference_column,) = horizon.columns[2:]
-    assert reference_column.replace("\n", "") == card.skill.reference
-    pearson_row = rows["vorticity_pearson"]
-    assert pearson_row[1].endswith("†")
-    rmse_row = rows["vorticity_rmse"]
-    assert rmse_row[0].endswith("[1/frame]")
-    assert at_frames.columns == ("metric", "15", "25")
-    scenarios = [row[0] for row in per_scenario.rows]
-    assert scenarios == ["3", "4"]
+    a = publish(tmp_path, first, method="a")
+    b = publish(tmp_path, second, method="b")
+    table, *_ = comparison_tables(compare(a, b))
+    assert table.rows[0][1] == side

@@ -89,25 +89,6 @@ def test_trace_of_an_offset_that_grows() -> None:
 
 
 @pytest.mark.parametrize("shift", SHIFTS)
-def test_trace_finds_the_shift(shift: int) -> None:
-    """Predicting the truth s frames away leaves no error at shift s.
-
-    Ends without a partner are NaN.
-    """
-    truth = rollout(frames=12)
-    moved = np.roll(truth, -shift, axis=0)
-    trace = trace_of(truth[:8], moved[:8])
-    shifted = trace.shifted[shift]
-    defined = shifted[~np.isnan(shifted)]
-    assert len(defined) == HORIZON - max(0, shift)
-    assert_allclose(defined, 0.0, atol=1e-30)
-
-    dynamics = analyse_error(trace)
-    assert dynamics.shift == shift
-    assert dynamics.shift_gain == 0.0
-
-
-@pytest.mark.parametrize("shift", SHIFTS)
 def test_a_shift_is_found_across_periodic_ends(shift: int) -> None:
     """A stream carries particles across the end of the box in each frame."""
     torus = Box.from_bounds(((0.0, 1.0), (0.0, 1.0)), periodic=[True, True])

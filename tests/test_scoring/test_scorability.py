@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import CliRunner
 from numpy.typing import NDArray
 
 import lagbench
-from lagbench.cli.program import app
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.local import locate
-from lagbench.errors import WorkFailedError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.metrics.coverage import Cloud, covered_nodes
@@ -118,8 +115,7 @@ def test_the_proposed_grid_makes_the_score_defined(
     assert not undefined_warnings(card)
 
 
-@pytest.mark.parametrize("side", [8, 15])
-@pytest.mark.parametrize("full_box", [True, False])
+@pytest.mark.parametrize(("side", "full_box"), [(8, True), (15, False)])
 def test_the_default_grid_fits_the_particles(
     tmp_path: Path, side: int, full_box: bool
 ) -> None:
@@ -162,72 +158,7 @@ def test_a_coarse_grid_is_a_reason(tmp_path: Path) -> None:
     assert len(list_reasons(split).splitlines()) == 2  # of test and of valid
 
 
-def test_different_particle_numbers_are_no_reason(tmp_path: Path) -> None:
-    trajectories = four_lattices(12)
-    trajectories[3] = lattice(10)
-    split = adopt_trajectories(tmp_path, trajectories)
-    assert not list_reasons(split)
-
-
 def test_data_without_motion_are_a_reason(tmp_path: Path) -> None:
     at_rest = four_lattices(12, speed=0.0)
     split = adopt_trajectories(tmp_path, at_rest)
     assert "nothing moves in test" in list_reasons(split)
-
-
-def test_a_short_scenario_is_a_reason(tmp_path: Path) -> None:
-    trajectories = four_lattices(12)
-    trajectories[1] = lattice(12, seed=9)[:4]
-    split = adopt_trajectories(tmp_path, trajectories)
-    assert not list_reasons(split)
-    # somebody asks for more than valid has
-    description = split.folder / "split.yaml"
-    text = description.read_text()
-    horizon = f"horizon: {split.horizon}"
-    assert horizon in text
-    longer = text.replace(horizon, f"horizon: {split.horizon + 1}")
-    description.write_text(longer)
-    assert "the task needs" in list_reasons(split)
-
-
-@pytest.mark.parametrize(
-    ("cells", "is_warned"),
-    [
-        (5, True),
-        (8, False),
-    ],
-)
-def test_a_training_begins_with_the_warning(
-    tmp_path: Path,
-    cells: int,
-    is_warned: bool,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """There is one warning, with a grid that helps, or none without a reason."""
-
-    def stop_training(*_: object, **__: object) -> None:
-        raise WorkFailedError("begun")
-
-    monkeypatch.setattr("lagbench.baselines.train.train", stop_training)
-    split = adopt_trajectories(
-        tmp_path,
-        four_lattices(12),
-        cells=cells,
-        full_box=True,
-    )
-    recipe = tmp_path / "own.yaml"
-    recipe.write_text(f"format: 1\nrecipes:\n  '*/{split.size}': {{}}\n")
-    arguments = [
-        "train",
-        "--baseline",
-        "mlp",
-        "--split",
-        str(split.folder),
-        "--recipe",
-        str(recipe),
-    ]
-    result = CliRunner().invoke(app, arguments)
-    before_training, message, _ = result.stderr.partition("lagbench: begun")
-    assert message
-    assert before_training.count("warning:") == is_warned
-    assert ("score_grid" in before_training) == is_warned

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import shutil
@@ -22,8 +21,7 @@ from lagbench.metrics import Direction, FramePair, Metric
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.front import digits
-from lagbench.scoring.published_scores import read_published_scores, read_scores
-from lagbench.scoring.score import scores_folder
+from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.task import SUBMISSION
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
@@ -125,16 +123,6 @@ def test_json_has_the_scores_of_the_card(persistence_card: ScoreCard) -> None:
             assert entry["values"] == values
             assert entry["undefined"] == list(score.undefined)
             assert ("at" in entry) == score.metric.per_frame
-
-
-def test_undefined_values_are_null_in_json(persistence_card: ScoreCard) -> None:
-    """At rest there is no correlation in any frame of both scenarios."""
-    content = load_json(persistence_card)
-    pearson = row_of_submission(content)["vorticity_pearson"]
-    horizon = persistence_card.config.horizon
-    assert pearson["mean"] is None
-    assert pearson["values"] == [None, None]
-    assert pearson["undefined"] == [horizon, horizon]
 
 
 def test_freezing_midway_leaves_frames_out(bench: ScoreBench, tmp_path: Path) -> None:
@@ -241,30 +229,6 @@ def test_a_wild_prediction_gets_finite_scores(
     assert content["flags"]["physics"]["raised"]
 
 
-def test_a_validated_file_is_not_validated_again(
-    bench: ScoreBench,
-    persistence_card: ScoreCard,
-    predictions: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The result of its validation gives the same card; that of another is refused."""
-    validated = validate(
-        predictions,
-        root=bench.root,
-        require_truth=True,
-        registry=bench.registry,
-    )
-    monkeypatch.setattr(scoring, "validate", None)
-    card = bench.evaluate(predictions, validated=validated)
-    assert card.predictions_sha256 == validated.sha256
-    assert card.predictions_sha256 == persistence_card.predictions_sha256
-    rows = card.as_json()["rows"]
-    assert rows == persistence_card.as_json()["rows"]
-    other = predictions.with_name("other.nc")
-    with pytest.raises(UsageError):
-        bench.evaluate(other, validated=validated)
-
-
 @pytest.mark.usefixtures("as_shipped")
 def test_invalid_predictions_are_refused(
     bench: ScoreBench, predictions: Path, tmp_path: Path
@@ -291,40 +255,6 @@ def test_a_root_without_the_data_set_is_an_error(
     with pytest.raises(DataError) as caught:
         scoring.score(path, root=tmp_path / "root", registry=bench.registry)
     assert "root/curl-noise/tiny/v2/test" in str(caught.value)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("ot") is None, reason="needs the extra transport"
-)
-def test_an_extra_brings_its_metrics(bench: ScoreBench, predictions: Path) -> None:
-    card = bench.evaluate(predictions, extras=("transport",))
-    assert card.submission["sinkhorn_pot"].mean > 0.0
-
-
-def test_a_card_becomes_a_table_of_values(bench: ScoreBench, tmp_path: Path) -> None:
-    """Each value of a row, a metric and a scenario has a line."""
-    path = bench.submit(tmp_path / "predictions.nc", half_right)
-    card = bench.evaluate(path)
-    table = card.to_dataframe()
-    is_submission = table.row == "submission"
-    is_ranking = table.metric == card.ranking
-    lines = table[is_submission & is_ranking]
-    assert lines.scenario.tolist() == list(card.scenarios)
-    expected = card.submission[card.ranking].mean
-    assert lines.value.mean() == pytest.approx(expected)
-    assert set(table.row) == set(card.scores)
-
-
-def test_predictions_for_another_split_are_refused(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
-    path = bench.submit(tmp_path / "predictions.nc", half_right)
-    with pytest.raises(UsageError) as caught:
-        bench.evaluate(path, split="fluid")
-    assert "fluid" in str(caught.value)
-    card = bench.evaluate(path, split=bench.size.split)
-    assert card.skill is not None
 
 
 def mean_height(pair: FramePair) -> float:
@@ -367,26 +297,7 @@ def test_own_metrics_are_measured_without_a_package(
     assert "fall" in set(card.to_dataframe()["metric"])
     plain = bench.evaluate(path)
     assert set(card.submission) - set(plain.submission) == {"mean_height", "fall"}
-    for file in card.files:
-        read = read_scores if file.suffix == ".json" else read_published_scores
-        assert "fall" not in read(file).scores[SUBMISSION]
-
-
-@pytest.mark.slow
-def test_an_own_metric_may_follow_from_others(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
-    path = bench.submit(tmp_path / "predictions.nc", still)
-    doubled = replace(
-        FALL,
-        name="doubled",
-        statistic=None,
-        of=["fall"],  # type: ignore[arg-type] # a list is as good as a tuple
-        series=lambda values: 2.0 * values,
-    )
-    card = bench.evaluate(path, metrics=[FALL, doubled])
-    fallen = card.submission["fall"].mean
-    assert card.submission["doubled"].mean == pytest.approx(2.0 * fallen)
+    assert "fall" not in read_statistics(card.files[1]).scores()
 
 
 @pytest.mark.parametrize(
@@ -429,16 +340,6 @@ def test_an_own_metric_that_fails_leaves_no_file_open(
     after = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE)
     assert after == before
     assert caught.value.__cause__ is not None
-
-
-def test_scores_stay_out_of_the_folder_of_a_split(tmp_path: Path) -> None:
-    """Predictions that are named after their local split are scored beside it."""
-    predictions = tmp_path / "own.nc"
-    assert scores_folder(predictions) == tmp_path / "own"
-    (tmp_path / "own").mkdir()
-    assert scores_folder(predictions) == tmp_path / "own"
-    (tmp_path / "own" / "split.yaml").write_text("format: 1\n")
-    assert scores_folder(predictions) == tmp_path / "own-scores"
 
 
 @pytest.mark.parametrize(

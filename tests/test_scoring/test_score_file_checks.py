@@ -41,13 +41,11 @@ def _virtual(file: h5py.File) -> None:
 
 HOSTILE: dict[str, Callable[[h5py.File], object]] = {
     "external link": lambda file: _link(file, h5py.ExternalLink("secret", "/film")),
-    "soft link": lambda file: _link(file, h5py.SoftLink("/measured")),
     "external storage": lambda file: _replace(file, external=[("secret", 0, 999_999)]),
     "virtual": _virtual,
     "bomb": lambda file: file.create_dataset(
         "bomb", (1 << 30,), "f4", compression="gzip", chunks=(1 << 20,)
     ),
-    "strings": lambda file: _replace(file, dtype=h5py.string_dtype()),
     "infinite": lambda file: file["value"].write_direct(
         np.full(file["value"].shape, np.inf, np.float32)
     ),

@@ -7,16 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 import lagbench
-from lagbench.data.local import locate
-from lagbench.data.scenario import read_scenario
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.references.predictor import given_in
-from lagbench.references.table import REFERENCES
 
 SIDE = 8
 FRAMES = 10
@@ -109,27 +104,3 @@ def test_truth_is_perfect_and_references_are_measured(
         assert math.isfinite(errors[name])
     assert {"analog", "frozen-field"} <= errors.keys()
     assert errors["frozen-field"] < 0.2 * errors["persistence"]
-
-
-def test_references_of_a_steady_flow_follow_it(made: LocalSplit) -> None:
-    """The first step of constant velocity is the given one, by the shortest way; the
-    projection solver carries the particles better than their last velocities do.
-    """
-    size = locate(made.folder).size
-    root = made.folder.parent
-    with read_scenario(size.path(root, 2)) as file:
-        given = given_in(file, size, root)
-    predictor = REFERENCES["constant-velocity"]
-    first = next(predictor.predict(given))
-    step = given.box.displacement(given.last, first.astype(np.float64))
-    assert_allclose(step, given.step, atol=1e-6)
-    assert np.abs(given.step).max() < 0.1
-
-    truth = carried(AMPLITUDES[2])[-1].astype(np.float64)
-    errors = {}
-    for name in ("constant-velocity", "projection-2x"):
-        *_, last = REFERENCES[name].predict(given)
-        error = given.box.displacement(truth, last.astype(np.float64))
-        mean_square = np.mean(error**2)
-        errors[name] = float(np.sqrt(mean_square))
-    assert errors["projection-2x"] < 0.6 * errors["constant-velocity"]

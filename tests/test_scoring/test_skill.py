@@ -14,8 +14,8 @@ import scipy.stats
 from numpy.testing import assert_allclose
 from score_bench import ScoreBench, straight
 
-from lagbench.data.registry import Measured, Registry, Size, load
-from lagbench.errors import DataError, UsageError
+from lagbench.data.registry import Measured, Size, load
+from lagbench.errors import DataError
 from lagbench.metrics import METRICS, Score
 from lagbench.references import references_of, shipped
 from lagbench.references.shipped import (
@@ -26,16 +26,9 @@ from lagbench.references.shipped import (
 from lagbench.references.shipped import solver_seconds as solver_seconds_of
 from lagbench.scoring import score as scoring
 from lagbench.scoring.front import NoSpeedup, Speedup
-from lagbench.scoring.measure_references import measure_and_ship
-from lagbench.scoring.references import (
-    measurable,
-    measure,
-    sizes_with_test_files,
-)
-from lagbench.scoring.score import speedup_beside
-from lagbench.scoring.skill import (
-    compute_skill,
-)
+from lagbench.scoring.measure_references import measure
+from lagbench.scoring.score import measurable, speedup_beside
+from lagbench.scoring.skill import compute_skill
 from lagbench.scoring.task import SUBMISSION
 from lagbench.submission import Header
 
@@ -256,6 +249,7 @@ def mean_curve(score: Score) -> Any:
     return score.per_frame.mean(axis=0)
 
 
+@pytest.mark.slow
 def test_shipped_scores_are_the_measured_ones(
     bench: ScoreBench, measured_references: References, tmp_path: Path
 ) -> None:
@@ -291,21 +285,7 @@ def test_shipped_scores_are_the_measured_ones(
     assert_allclose(curve, expected_curve, rtol=6e-3)
 
 
-def test_another_data_set_has_no_shipped_scores(
-    bench: ScoreBench, measured_references: References, tmp_path: Path
-) -> None:
-    write_shipped(
-        record(bench.size),
-        measured_references,
-        dataset_sha256=SHA256,
-        reported=(15, 25),
-        folder=tmp_path,
-    )
-    other = record(bench.size, OTHER_SHA256)
-    assert shipped(other, tmp_path) is None
-    assert shipped(bench.size, tmp_path) is None
-
-
+@pytest.mark.slow
 def test_one_reference_measured_anew_leaves_the_others(
     bench: ScoreBench, measured_references: References, tmp_path: Path
 ) -> None:
@@ -346,34 +326,7 @@ def test_one_reference_measured_anew_leaves_the_others(
         )
 
 
-def test_a_reference_that_a_data_set_lacks_is_not_measured(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
-    """A coarse solver at tiny: nothing is written."""
-    with pytest.raises(UsageError):
-        measure_and_ship(
-            record(bench.size),
-            bench.root,
-            folder=tmp_path,
-            names=["coarse-solver"],
-        )
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_size_that_only_some_splits_have_can_be_measured(bench: ScoreBench) -> None:
-    """A split of another package need not have all sizes of ours."""
-    split = bench.registry.split(bench.size.split)
-    other_size = {"other": split.sizes[bench.size.name]}
-    other_split = split.model_copy(update={"sizes": other_size})
-    splits = {"beside": other_split, **bench.registry.splits}
-    registry = Registry(splits, bench.registry.measured)
-    sizes = sizes_with_test_files(bench.root, name=bench.size.name, registry=registry)
-    assert [size.split for size in sizes] == [bench.size.split]
-    assert sizes_with_test_files(bench.root, name="other", registry=registry) == []
-    with pytest.raises(UsageError):
-        sizes_with_test_files(bench.root, name="none", registry=registry)
-
-
+@pytest.mark.slow
 def test_scoring_takes_what_is_shipped(
     bench: ScoreBench,
     measured_references: References,
