@@ -36,7 +36,7 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Metric
 from lagbench.scoring import score as scorer
-from lagbench.scoring.scenarios import ScenarioScores
+from lagbench.scoring.score import ScenarioScores
 from lagbench.scoring.task import ScoredTask
 from lagbench.work.engine import ENGINES
 from lagbench.work.run import Meter

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.errors import DataError
-from lagbench.scoring.scenarios import ScenarioJob, ScenarioScores, score_scenario
+from lagbench.scoring.score import ScenarioJob, ScenarioScores, score_scenario
 from lagbench.work.executor import Report
 
 

@@ -29,7 +29,7 @@ from lagbench.metrics.aggregate import Tally, score
 from lagbench.metrics.table import METRICS
 from lagbench.references.predictor import Kind, given_in
 from lagbench.references.table import references_of
-from lagbench.scoring.scenarios import time_frames
+from lagbench.scoring.score import time_frames
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.machine import available_cores, processor_name

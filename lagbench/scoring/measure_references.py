@@ -37,8 +37,7 @@ from lagbench.references.shipped import (
 from lagbench.references.table import REFERENCES, references_of
 from lagbench.work.run import Meter, Progress
 
-from .scenarios import score_scenarios, time_frames
-from .score import check_train
+from .score import check_train, score_scenarios, time_frames
 from .task import load_scored_task, predict_reference
 
 TIMED_SCENARIOS = 2

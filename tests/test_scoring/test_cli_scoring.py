@@ -14,7 +14,7 @@ from command_line import Result
 from conftest import SIZE, SPLIT
 
 from lagbench.make.generate import GenerationResult
-from lagbench.scoring import scenarios
+from lagbench.scoring import score
 
 Run = Callable[..., Result]
 
@@ -128,7 +128,7 @@ def test_an_unusable_folder_is_an_error_before_the_work(
     run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
     """A file is in the place of the folder."""
-    monkeypatch.setattr(scenarios, "run_all", None)
+    monkeypatch.setattr(score, "run_all", None)
     file = predictions.parent / "taken"
     file.write_text("")
     result = run("score", predictions, option, file)

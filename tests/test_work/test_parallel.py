@@ -29,7 +29,7 @@ from lagbench.data.registry import Registry
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
-from lagbench.scoring.scenarios import ScenarioJob, ScenarioScores
+from lagbench.scoring.score import ScenarioJob, ScenarioScores
 from lagbench.work import run
 from lagbench.work.executor import WorkItem, run_items
 
