@@ -91,6 +91,13 @@ COMMANDS = (
     ),
     Command(
         "Other people's data",
+        "adopt",
+        "local_splits:import_command",
+        "The same as import.",
+        "adopt runs/*.npz -o own --frame-interval 0.1",
+    ),
+    Command(
+        "Other people's data",
         "export",
         "export:export_command",
         "Write a split in the file format of another code base.",

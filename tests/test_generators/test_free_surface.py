@@ -67,6 +67,32 @@ def test_free_flight_is_a_parabola(material: Material) -> None:
 
 
 @pytest.mark.parametrize("material", Material)
+def test_momentum_and_spin_are_conserved(material: Material) -> None:
+    """Without gravity and walls, sums of v and of r x v + dx^2/4 (C_yx - C_xy) stay."""
+    state = scenario(WEIGHTLESS, Part(material, DISC, (0.5, 0.5)))
+    x, y = (state.position - 0.5).T
+    rotation = 3.0 * np.stack([-y, x], axis=1)
+    gradient = np.array([[0.0, -3.0], [3.0, 0.0]])
+    turning = dataclasses.replace(
+        state,
+        velocity=rotation + np.array([0.1, 0.2]),
+        affine=np.tile(gradient, (len(x), 1, 1)),
+    )
+    solver = start(WEIGHTLESS, [turning])
+    sums = []
+    for _ in range(2):
+        x, y = solver.position()[0].astype(np.float64).T
+        u, v = solver.velocity()[0].astype(np.float64).T
+        affine = solver.affine()[0].astype(np.float64)
+        spin = 0.25 / WEIGHTLESS.grid**2 * (affine[:, 1, 0] - affine[:, 0, 1])
+        sums.append([u.sum(), v.sum(), (x * v - y * u + spin).sum()])
+        solver.advance(100)
+    before, after = np.array(sums)
+    assert_allclose(after[:2], before[:2], rtol=1e-4)
+    assert_allclose(after[2], before[2], rtol=2e-3)
+
+
+@pytest.mark.parametrize("material", Material)
 def test_compression_stores_energy(material: Material) -> None:
     """An impact turns kinetic into elastic energy; nothing is gained."""
     centre = (0.5, LOW + 0.16)

@@ -1,4 +1,6 @@
-"""The free-surface solver's bits: drivers and orders of particles agree exactly."""
+"""The free-surface solver's bits: drivers, orders of particles and NumPy agree
+exactly.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ import dataclasses
 import numpy as np
 import pytest
 from free_surface_scenarios import Part, parameters, run, scenario, snapshot
+from reference_free_surface import FreeSurfaceReference
 
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Disc, Rectangle
@@ -61,6 +64,22 @@ CASES = [
     pytest.param(BRAKED_SNOW, id="snow with friction"),
     pytest.param(MIXED, id="all four"),
 ]
+
+
+@pytest.mark.parametrize("state", CASES)
+def test_numpy_gives_the_same_bits(state: InitialState) -> None:
+    reference = FreeSurfaceReference(CONSTANTS, state)
+    reference.advance(100)
+    shape = (CONSTANTS.particles, 2, 2)
+    expected = [
+        reference.position,
+        reference.velocity,
+        np.stack(reference.affine, axis=1).reshape(shape),
+        np.stack(reference.deformation, axis=1).reshape(shape),
+        reference.ratio,
+    ]
+    solved = [array[0] for array in run(CONSTANTS, [state], 100)]
+    np.testing.assert_equal(solved, expected)
 
 
 @pytest.mark.skipif(available_cores() < 2, reason="one processor")
