@@ -47,6 +47,9 @@ REPAIR = (
 MOST_LETTERS = 80
 """Letters of a wrong attribute in a message."""
 
+DECODED = ("units", "scale_factor", "add_offset", "_FillValue", "missing_value")
+"""Attributes of a variable by which xarray changes the values that it returns."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioHeader:
@@ -233,6 +236,22 @@ class ScenarioFile:
         for block in self.blocks("material"):
             require_known_material(block, where=str(self.path), fix=REPAIR)
 
+    def check_units(self) -> None:
+        """Refuse attributes that make other readers see other values than are hashed.
+
+        Raises:
+            DataError: a unit is not that of the format, or values are packed.
+        """
+        for name, variable in self._variables.items():
+            with _damage_errors(self.path):
+                stated = {key: read_attribute(variable, key) for key in DECODED}
+            for key, value in stated.items():
+                if value != ATTRIBUTES[name].get(key):
+                    raise DataError(
+                        f"{key} is {value!r:.40}, and no hash covers it; {REPAIR}",
+                        where=f"{self.path}, variable {name!r}",
+                    )
+
     def stored_hashes(self) -> dict[str, object]:
         """Return the hash of each variable as the file states it."""
         hashes = {}
@@ -278,7 +297,7 @@ def rehash(path: Path) -> str:
 
 
 def check_scenario(path: Path, expected: str | None = None) -> str:
-    """Recompute a file's content hash, compare it, and check materials.
+    """Recompute a file's content hash, compare it, and check materials and units.
 
     Args:
         path: the scenario file.
@@ -288,7 +307,8 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
         The content hash.
 
     Raises:
-        DataError: a hash differs, or a material is unknown.
+        DataError: a hash differs, a material is unknown, or a unit is not that of the
+            format.
     """
     with read_scenario(path) as file:
         stored_hashes = file.stored_hashes()
@@ -312,6 +332,7 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
                     where=where,
                 )
         file.check_material()
+        file.check_units()
     return content_hash
 
 

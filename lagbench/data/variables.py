@@ -2,7 +2,8 @@
 
 Attributes of variables do not enter the content hash, yet readers compute with them: a
 ``scale_factor`` or other ``units`` change what xarray returns although no stored value
-changed. So a variable has exactly the attributes of :data:`ATTRIBUTES`.
+changed. So ``verify`` refuses such attributes where they are not those of
+:data:`ATTRIBUTES`.
 
 Parameters of a scenario are attributes of the file. They do enter the hash.
 """

@@ -290,7 +290,7 @@ def _judge(
     if interval is None:
         raise UsageError(
             f"{name} does not state the time between two frames; add --frame-interval "
-            "SECONDS"
+            "SECONDS, in Python frame_interval=SECONDS"
         )
     if trajectory.interval and abs(trajectory.interval / interval - 1.0) > 0.01:
         raise UsageError(

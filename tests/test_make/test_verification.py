@@ -139,6 +139,16 @@ def rewritten(path: Path) -> None:
         file["velocity"][7, 11, 0] += np.float32(1e-6)
 
 
+def described(**attributes: object) -> Callable[[Path], None]:
+    """Return what changes how readers understand positions, not a stored value."""
+
+    def change(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            file["position"].attrs.update(attributes)
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
@@ -150,6 +160,8 @@ def rewritten(path: Path) -> None:
             "damaged",
         ),
         (rewritten, "variable 'velocity'"),
+        (described(scale_factor=2.0), "(?s)variable 'position'.*scale_factor"),
+        (described(units="m"), "(?s)variable 'position'.*units"),
         (
             lambda path: shutil.copy(path.with_name("0004.nc"), path),
             "another scenario",
