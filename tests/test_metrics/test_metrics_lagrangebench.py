@@ -119,7 +119,7 @@ def test_entries_of_a_leaderboard_do_not_state_them() -> None:
 
     The Sinkhorn divergence is stated where it was measured.
     """
-    path = BOARD / "scores/poiseuille/mini/neuralmpm_0.nc"
+    path = BOARD / "scores/curl-noise-3d/mini/neuralmpm_0.nc"
     tallies = read_statistics(path).tallies
     assert "energy_error" in combine([tallies])
     assert "e_kin_mse" not in combine([tallies])
