@@ -229,7 +229,7 @@ def conclude(board: Board) -> list[str]:
             f"It is not shown that learning pays on any of {total} judged data sets: "
             "on each a classical or calibrated solver is as accurate as the best "
             "network in the same time or less, or the difference is within the 95 % "
-            "interval."
+            "interval or the noise of measured times."
         )
     if not open_count:
         return [result]

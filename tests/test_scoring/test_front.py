@@ -110,10 +110,11 @@ def test_seeds_and_scenarios_widen_the_interval() -> None:
     assert low < 2.0 < high
 
 
-def test_learning_pays_where_the_interval_is_above_one() -> None:
-    model = row("learned", 2.0, 0.2, spread=0.5)
-    speedup = compute_speedup(model, ROWS)
-    assert speedup.pays == (speedup.p < 0.05)
+@pytest.mark.parametrize(("ratio", "pays"), [(1.2, False), (1.3, True)])
+def test_learning_pays_beyond_the_noise_of_costs(ratio: float, pays: bool) -> None:
+    speedup = compute_speedup(row("learned", 4.0 / ratio, 0.2), ROWS)
+    assert speedup.interval == pytest.approx((ratio, ratio))
+    assert speedup.pays is pays
 
 
 def made_speedup(p: float) -> Speedup:
