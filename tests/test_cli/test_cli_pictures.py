@@ -67,6 +67,6 @@ def test_data_that_cannot_be_read_have_their_exit_codes(
     missing = ("--size", "tiny", "--root", tmp_path)
     scenario = generated.folder / "test" / "0003.nc"
     assert run(command, "cavity", *missing, *film).exit_code == 4
-    assert run(command, text, *film).exit_code == 3
-    assert run(command, tmp_path / "none.nc", *film).exit_code == 3
+    assert run(command, text, *film).exit_code == 4
+    assert run(command, tmp_path / "none.nc", *film).exit_code == 4
     assert run(command, scenario, "--scenario", 4, *film).exit_code == 2

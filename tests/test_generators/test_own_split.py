@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import Result
 
-from lagbench.data.registry import Registry, Size, load
+from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import (
     LagbenchError,
@@ -23,7 +22,6 @@ from lagbench.generators.batch import (
 )
 from lagbench.generators.constants import solver_constants, split_module
 from lagbench.generators.simulate import simulate
-from lagbench.make.generate import GenerationResult
 
 Install = Callable[..., Path]
 
@@ -131,24 +129,3 @@ def test_parameters_of_our_own_splits_are_blamed_on_the_registry(
     with pytest.raises(LagbenchError) as caught:
         draw_initial_state(size.model_copy(update={"parameters": parameters}), 0)
     assert isinstance(caught.value, UnreadableFileError)
-
-
-def test_a_split_without_recorded_hashes_says_how_to_record_them(
-    generated: GenerationResult,
-    unmeasured: Registry,
-    unmeasured_path: Path,
-    run: Callable[..., Result],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Generate and verify name the command, and its options are those of the data."""
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
-    for command in ("generate", "verify"):
-        words = (command, generated.split, "--size", generated.size)
-        result = run(*words, "--root", generated.root)
-        assert result.exit_code == 0, result.stderr
-        (line,) = [
-            line for line in result.stdout.splitlines() if "generators.record" in line
-        ]
-        assert f"--split {generated.split} --size {generated.size} " in line
-        assert f"--root {generated.root}" in line
-        assert f"--registry {unmeasured_path}" in line
