@@ -80,9 +80,14 @@ def check_output_file(
     """Refuse, before the work, a file to write that must not be replaced.
 
     Raises:
-        UsageError: it is a folder or a device, or such a file is there and may not be
-            replaced.
+        UsageError: it is a folder, a device or an address, or such a file is there and
+            may not be replaced.
     """
+    if ":" in output.parts[0] and len(output.parts) > 1:
+        raise UsageError(
+            f"{output} is an address; write {output.name}, then copy it there",
+            where=option,
+        )
     if output.exists() and not output.is_file():
         raise UsageError(f"{output} is not a file; name a file", where=option)
     if os.path.lexists(output) and not overwrite:

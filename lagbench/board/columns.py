@@ -231,7 +231,7 @@ MAIN_COLUMNS = (
         group="main",
         meaning="Cost of the classical side at the method's error / cost of the method."
         " >: no classical row is as accurate. Learning pays where the interval of a "
-        "model is above 1.25.",
+        "model is above 1.5.",
         read=_speedup,
     ),
     Column(

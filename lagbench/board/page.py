@@ -201,7 +201,7 @@ def render(
 
 
 def describe_goal(tab: Tab) -> str:
-    """Return the corners of the classical side: a network pays below one of them."""
+    """Return the corners of the classical side: the cheapest first."""
     corners = []
     for row in tab.hull:
         milliseconds = format_number(1e3 * row.seconds)

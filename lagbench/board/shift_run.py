@@ -97,7 +97,9 @@ def score_on_shift(
     if not entries:
         chosen = [entry for entry in chosen if SUBSET in runs.size(entry).subsets]
     if not chosen:
-        raise UsageError("no entry to score on shift; `lagbench list` shows subsets")
+        raise UsageError(
+            "no entry to score on shift; `lagbench info SPLIT` shows subsets"
+        )
 
     for entry in chosen:
         tier = runs.size(entry)

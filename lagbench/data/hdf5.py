@@ -51,6 +51,9 @@ INSIDE = (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED)
 
 OBJECTS = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "variable"}
 
+FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
+"""Filters that every reader has."""
+
 HARMLESS_BYTES = 1 << 28
 """Any array or chunk may unpack to this many bytes."""
 
@@ -186,6 +189,14 @@ def find_storage_issue(variable: h5py.Dataset) -> str | None:
     if properties.get_external_count() or properties.get_layout() not in INSIDE:
         return "the values lie in other files"
     item = 1 if is_text_of_any_length(variable) else variable.dtype.itemsize
+    if properties.get_layout() == h5py.h5d.CHUNKED:
+        chunk = item * math.prod(properties.get_chunk())
+        if chunk > HARMLESS_BYTES:
+            return f"a chunk has {chunk} bytes"
+    filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+    # Each zlib multiplies what a chunk may unpack to by a thousand.
+    if len(set(filters)) < len(filters) or not set(filters) <= set(FILTERS):
+        return "it needs other filters than zlib, shuffle and checksum, each once"
     unpacked = item * math.prod(variable.shape or (0,))
     packed = variable.id.get_storage_size()
     if unpacked > max(HARMLESS_BYTES, MAX_ARRAY_RATIO * packed):

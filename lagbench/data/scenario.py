@@ -243,12 +243,12 @@ class ScenarioFile:
             DataError: a unit is not that of the format, or values are packed.
         """
         for name, variable in self._variables.items():
-            with _damage_errors(self.path):
-                stated = {key: read_attribute(variable, key) for key in DECODED}
-            for key, value in stated.items():
-                if value != ATTRIBUTES[name].get(key):
+            for key in DECODED:
+                with _damage_errors(self.path, name):
+                    value = str(read_attribute(variable, key))
+                if value != str(ATTRIBUTES[name].get(key)):
                     raise DataError(
-                        f"{key} is {value!r:.40}, and no hash covers it; {REPAIR}",
+                        f"{key} is {value[:40]}, and no hash covers it; {REPAIR}",
                         where=f"{self.path}, variable {name!r}",
                     )
 
@@ -372,7 +372,7 @@ def _read_header(
         device=_require_text(file, "device"),
         generator=_require_text(file, "generator"),
         lagbench_version=_require_text(file, "lagbench_version"),
-        facts=json.loads(str(read_attribute(file, "facts") or "{}")),
+        facts=_read_facts(file),
     )
 
 
@@ -392,6 +392,15 @@ def _require_integer(file: h5py.File, name: str) -> int:
 
 def _require_text(file: h5py.File, name: str) -> str:
     return str(_require_attribute(file, name))
+
+
+def _read_facts(file: h5py.File) -> dict[str, float]:
+    """Return the simulation diagnostics of a file: numbers by name."""
+    facts = json.loads(str(read_attribute(file, "facts") or "{}"))
+    for name, value in facts.items():
+        if not (name.isidentifier() and name.isascii() and math.isfinite(value)):
+            raise DataError("the attribute 'facts' is no table of finite numbers")
+    return dict(facts)
 
 
 @contextmanager

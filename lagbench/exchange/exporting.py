@@ -110,9 +110,8 @@ def export(
         has_moving_walls = "wall_velocity" in file.variables
     module: Any = CODE_BASES.get(format)
     origin = np.zeros(tier.dimension, np.float32)
-    if module is lagrangebench_h5 and (
-        tier.is_full_box or has_moving_walls or tier.box.is_periodic
-    ):
+    is_closed = tier.is_full_box or has_moving_walls or tier.box.is_periodic
+    if module is lagrangebench_h5 and is_closed:
         # taking it off a float32 above it and below 16 loses no bit
         origin = (np.floor(np.array(tier.box.low) * 2**20) / 2**20).astype(np.float32)
 
@@ -142,7 +141,7 @@ def export(
         trajectories[subset] = len(lengths)
         frames[subset] = sum(lengths)
     if module is not None:
-        metadata = _describe(tier, data_root, module, origin)
+        metadata = _describe(tier, data_root, module, origin, is_closed=is_closed)
         metadata["dx"] = volume ** (1.0 / tier.dimension)
         files.append(target / "metadata.json")
         text = json.dumps(metadata, indent=1) + "\n"
@@ -187,6 +186,8 @@ def _describe(
     root: Path,
     module: Any,  # noqa: ANN401 (gns_npz or lagrangebench_h5)
     origin: NDArray[np.float32],
+    *,
+    is_closed: bool,
 ) -> dict[str, Any]:
     """Return what metadata.json says of a data set, and where that is from."""
     recorded = size.measured or read_manifest(root, size.split, size.name, size.major)
@@ -196,7 +197,7 @@ def _describe(
             f"without an acceleration; {suggest_repair(size, root=root)}"
         )
     bounds = np.array(size.bounds) - origin[:, None]
-    if module is lagrangebench_h5 and not origin.any():
+    if module is lagrangebench_h5 and not is_closed:
         # Its cell lists start at 0 and are as long as the bounds are apart: particles
         # beyond the difference would lose their neighbours.
         bounds[:] = [0.0, 1.0]

@@ -1,1 +1,1 @@
-"""Make data sets: generate, verify, describe, clean."""
+"""Make data sets: generate, verify, describe."""
