@@ -173,7 +173,9 @@ def load(path: str | Path) -> Checkpoint:
     ) as error:
         first_line = str(error).split("\n")[0]
         raise UnreadableFileError(
-            f"no weights of lagbench in a .safetensors file: {first_line[:200]}",
+            f"no weights of lagbench in a .safetensors file: {first_line[:200]}; name "
+            "weights that `lagbench train` wrote; if the file was copied or "
+            "downloaded, compare its length",
             where=str(path),
         ) from error
 

@@ -35,7 +35,7 @@ from pydantic import (
 
 from lagbench.data.layout import expand_home
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 
 from .baseline import Settings
 from .catalogue import CatalogueEntry
@@ -276,7 +276,9 @@ def recipe_for(
         try:
             file = _RecipeFile.model_validate(read_yaml(path))
         except ValidationError as error:
-            raise UnreadableFileError(_describe(error), where=str(path)) from None
+            raise UnreadableFileError(
+                _describe(error, _RecipeFile), where=str(path)
+            ) from None
 
     size_name = size
     if variant:
@@ -284,9 +286,11 @@ def recipe_for(
     name = f"{split}/{size_name}"
     part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{size_name}")
     if part is None and (file.recipes or variant):
+        of_split = [known for known in file.recipes if known.startswith(f"{split}/")]
         raise UsageError(
-            f"{entry.name} has no recipe {name!r}, but of {', '.join(file.recipes)}; "
-            "write your own, --recipe FILE.yaml: docs/baselines.md"
+            f"{entry.name} has no recipe {name!r} (of {split}: "
+            f"{', '.join(of_split) or 'none'}); write your own, --recipe FILE.yaml: "
+            "docs/baselines.md"
         )
     if part is None:
         part = _SharedRecipe()
@@ -302,9 +306,13 @@ def recipe_for(
     if seed is not None:
         layers["training"]["seed"] = seed
 
-    where = f"{entry.name}, {name}"
-    model = check_options(entry.model.Options, layers["model"], f"{where}, model")
-    training = check_options(TrainingOptions, layers["training"], f"{where}, training")
+    where = f"{path or entry.name}, {name}"
+    model = check_options(
+        entry.model.Options, layers["model"], where, group="model", settings=settings
+    )
+    training = check_options(
+        TrainingOptions, layers["training"], where, group="training", settings=settings
+    )
     return Recipe(
         baseline=entry.name,
         name=name,
@@ -328,8 +336,8 @@ def change_options(
     for setting in settings:
         layers = _merge(layers, _parse_setting(setting))
     model_options = entry.model.Options
-    old = check_options(model_options, dict(options), "--set")
-    new = check_options(model_options, layers["model"], "--set")
+    old = check_options(model_options, dict(options), "--set", group="model")
+    new = check_options(model_options, layers["model"], "--set", group="model")
     before = old.model_dump(mode="json")
     after = new.model_dump(mode="json")
     fixed = model_options.in_training | model_options.of_weights
@@ -380,8 +388,22 @@ def _parse_setting(text: str) -> Layer:
     return dict(layer)
 
 
-def check_options(options: type[OptionsT], values: Layer, where: str) -> OptionsT:
+def check_options(
+    options: type[OptionsT],
+    values: Layer,
+    where: str,
+    *,
+    group: str,
+    settings: Iterable[str] = (),
+) -> OptionsT:
     """Return checked options.
+
+    Args:
+        options: class of the options.
+        values: their values by name.
+        where: the recipe that they come from, for messages.
+        group: ``model`` or ``training``.
+        settings: changes of the recipe; a mistake in one of them is one of ``--set``.
 
     Raises:
         UsageError: an option is unknown, or its value does not fit.
@@ -389,11 +411,21 @@ def check_options(options: type[OptionsT], values: Layer, where: str) -> Options
     try:
         return options.model_validate(values)
     except ValidationError as error:
-        raise UsageError(_describe(error), where=where) from None
+        key = ".".join(map(str, (group, *error.errors()[0]["loc"])))
+        if any(setting.strip().startswith(key) for setting in settings):
+            where = "--set"
+        raise UsageError(_describe(error, options, f"{group}."), where=where) from None
 
 
-def _describe(error: ValidationError) -> str:
+def _describe(
+    error: ValidationError, options: type[BaseModel], prefix: str = ""
+) -> str:
     """Return the first thing that pydantic finds wrong."""
     detail = error.errors()[0]
     key = ".".join(map(str, detail["loc"]))
-    return f"{key} = {detail['input']!r}: {detail['msg']}"
+    if detail["type"] != "extra_forbidden":
+        return f"{prefix}{key} = {detail['input']!r}: {detail['msg']}"
+    if len(detail["loc"]) > 1:
+        return f"no such key {prefix + key!r}; docs/baselines.md lists the keys"
+    hint = suggest_name(key, options.model_fields, prefix=prefix)
+    return f"no such key {prefix + key!r}; {hint}"

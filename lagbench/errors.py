@@ -255,7 +255,7 @@ def suggest_name(name: str, known_names: Iterable[str], *, prefix: str = "") -> 
     if len(names) > MOST_NAMES:
         words.append("...")
     listing = f"known: {', '.join(words) or 'none'}"
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(name, names, n=1)
     if not near:
         return listing
     return f"did you mean {prefix + near[0]!r}? {listing}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -128,9 +129,11 @@ class ModelRuns:
         chosen = []
         for name in names:
             if name not in known:
+                nearest = difflib.get_close_matches(name, known, cutoff=0.0)
                 raise UsageError(
-                    f"no entry {name!a} in {self.folder.path}; "
-                    f"{suggest_name(name, known)}"
+                    f"no entry {name!a} in {self.folder.path}; nearest: "
+                    f"{', '.join(nearest) or 'none'}; `lagbench leaderboard show` "
+                    "prints all"
                 )
             entry = read_entry(self.folder.path / known[name])
             if not entry.models:

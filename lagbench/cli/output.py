@@ -117,14 +117,13 @@ def print_result(
 
 
 def print_errors(result: ValidationResult) -> None:
-    """Print on stderr all errors of a file where it has several.
+    """Print on stderr all errors of a file but the deciding one.
 
-    The command then ends with the first of them, which is not printed here where it is
-    the only one.
+    The command then ends with that one.
     """
-    if len(result.errors) > 1:
-        lines = [str(error) for error in result.errors]
-        print_on_stderr("\n".join(lines))
+    for error in result.errors:
+        if error is not result.deciding:
+            print_on_stderr(str(error))
 
 
 def print_tables(tables: Iterable[Table]) -> None:

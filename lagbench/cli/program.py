@@ -10,7 +10,14 @@ from contextlib import suppress
 from importlib.metadata import version
 from typing import Any
 
-from cyclopts import App, CycloptsError, Group, Parameter, UnknownCommandError
+from cyclopts import (
+    App,
+    CycloptsError,
+    Group,
+    Parameter,
+    UnknownCommandError,
+    UnknownOptionError,
+)
 
 from lagbench.errors import LagbenchError, explain_system_error, suggest_name
 
@@ -77,6 +84,12 @@ def app(words: Sequence[str] | None = None) -> int:
             typed_name = " ".join((error.unused_tokens or ())[:1])
             hint = suggest_name(typed_name, [command.name for command in COMMANDS])
             text = f"no such command: {typed_name!r}; {hint}"
+        elif isinstance(error, UnknownOptionError):
+            typed_name = error.token.keyword or error.token.value
+            names = {name for one in error.argument_collection for name in one.names}
+            options = [name[2:] for name in names if name.startswith("--")]
+            hint = suggest_name(typed_name.lstrip("-"), options, prefix="--")
+            text = f"no such option: {typed_name}; {hint}"
         else:
             text = str(error)
         print_on_stderr(f"{chain}: {text}\n`{chain} --help` lists what there is")

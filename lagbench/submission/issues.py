@@ -162,11 +162,22 @@ class ValidationResult:
             return error.exit_code
         return 0
 
+    @property
+    def deciding(self) -> ValidationIssue | None:
+        """The error that the message of :meth:`check` describes; None of a valid file.
+
+        The first error of ``readable``, else of ``dataset``, else of all.
+        """
+        for check in ERROR_CLASSES:
+            for issue in self.errors:
+                if issue.check == check:
+                    return issue
+        return next(iter(self.errors), None)
+
     def check(self) -> None:
         """Raise unless the file is valid.
 
-        The message describes the first error of the check that decides the class:
-        ``readable`` before ``dataset``, and both before all other checks.
+        The message describes the deciding error.
 
         Raises:
             UnreadableFileError: the file cannot be read.
@@ -174,20 +185,17 @@ class ValidationResult:
                 missing.
             ChecksFailedError: another check failed.
         """
-        if self.valid:
+        deciding = self.deciding
+        if deciding is None:
             return
-        deciding = self.errors[0]
-        for check in ERROR_CLASSES:
-            of_check = [issue for issue in self.errors if issue.check == check]
-            if of_check:
-                deciding = of_check[0]
-                break
+        place = ""
+        if deciding.where != str(self.path):
+            place = f" {escape_line(deciding.where)}:"
         more = ""
         if len(self.errors) > 1:
             more = f" (and {len(self.errors) - 1} more)"
         raise ERROR_CLASSES.get(deciding.check, ChecksFailedError)(
-            f"{self.verdict}: [{deciding.check}] {escape_line(deciding.where)}: "
-            f"{deciding.what}{more}",
+            f"{self.verdict}: [{deciding.check}]{place} {deciding.what}{more}",
             where=escape_line(str(self.path)),
         )
 

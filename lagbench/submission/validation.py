@@ -264,12 +264,16 @@ def _check_task(info: FileInfo, size: Size, root: Path, issues: IssueCollector) 
         is_known = scenario in size.scored_scenarios
         if is_known and count != size.particle_count(scenario):
             wrong_counts[scenario] = count
-    if shape[2] != most or wrong_counts:
+    what = None
+    if shape[2] != most:
+        what = f"{shape[2]} particles, not {most}"
+    elif wrong_counts:
+        what = f"wrong numbers of particles by scenario: {quote(wrong_counts)}"
+    if what is not None:
         issues.error(
             "particles",
-            f"{shape[2]} particles in a scenario, not {most}, or other numbers in some "
-            f"({quote(wrong_counts)}); predict every particle of {name}, in the order "
-            "of the given frames",
+            f"{what}; predict every particle of {name}, in the order of the given "
+            "frames",
             where="variable 'position', dimension 'particle'",
         )
         return False

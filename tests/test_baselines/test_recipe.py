@@ -204,6 +204,21 @@ def test_mistakes_in_settings(entry: CatalogueEntry, setting: str) -> None:
         recipe_for(entry, "cavity", "tiny", settings=[setting])
 
 
+def test_an_unknown_key_is_found_where_it_stands(
+    entry: CatalogueEntry, tmp_path: Path
+) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("{format: 1, training: {learning_rat: 1}}")
+    for variant, settings, place in (
+        (str(own), [], str(own)),
+        (None, ["training.learning_rat=1"], "--set"),
+    ):
+        with pytest.raises(UsageError) as caught:
+            recipe_for(entry, "cavity", "tiny", variant=variant, settings=settings)
+        assert str(caught.value).startswith(place)
+        assert "'training.learning_rate'" in str(caught.value)
+
+
 def test_no_such_recipe(entry: CatalogueEntry) -> None:
     """A baseline without a file of recipes has the defaults."""
     bare = replace(entry, recipes=None)

@@ -75,7 +75,7 @@ def test_a_template_replaces_predictions_only_on_request(
 def test_score_and_validate_agree_on_unreadable_files(
     run: Run, predictions: Path, damage: str
 ) -> None:
-    """The message is one line, without a traceback."""
+    """The message is one line, without a traceback, and names the file once."""
     if damage == "truncated":
         predictions.write_bytes(predictions.read_bytes()[:20_000])
     else:
@@ -84,7 +84,18 @@ def test_score_and_validate_agree_on_unreadable_files(
     assert result.exit_code == 3
     assert run("validate", predictions).exit_code == 3
     assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.count(str(predictions)) == 1
     assert "Traceback" not in result.output
+
+
+def test_score_names_every_error_once(run: Run, predictions: Path) -> None:
+    with h5py.File(predictions, "r+") as file:
+        file.attrs["dataset_version"] = "99.0.0"
+        file.attrs["seconds_per_frame"] = -1.0
+    result = run("score", predictions)
+    assert result.exit_code == 4
+    for name in ("dataset_version", "seconds_per_frame"):
+        assert result.stderr.count(f"'{name}'") == 1
 
 
 @pytest.mark.parametrize("method", ["[/b]", "[red]x[/red]"])
