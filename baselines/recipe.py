@@ -422,10 +422,11 @@ def _describe(
 ) -> str:
     """Return the first thing that pydantic finds wrong."""
     detail = error.errors()[0]
-    key = ".".join(map(str, detail["loc"]))
+    name = ".".join(map(str, detail["loc"]))
+    key = (prefix + name).rstrip(".")
     if detail["type"] != "extra_forbidden":
-        return f"{prefix}{key} = {detail['input']!r}: {detail['msg']}"
+        return f"{key} = {detail['input']!r}: {detail['msg']}"
     if len(detail["loc"]) > 1:
-        return f"no such key {prefix + key!r}; docs/baselines.md lists the keys"
-    hint = suggest_name(key, options.model_fields, prefix=prefix)
-    return f"no such key {prefix + key!r}; {hint}"
+        return f"no such key {key!r}; docs/baselines.md describes recipes"
+    hint = suggest_name(name, options.model_fields, prefix=prefix)
+    return f"no such key {key!r}; {hint}"
