@@ -41,7 +41,8 @@ def compare_command(
         first: A predictions.nc, scores.json or scores.nc; or a folder of the scores of
             one method, with one or several seeds; or an entry of the leaderboard, as in
             cavity/mini/gns.
-        second: The same, or the name of a reference predictor.
+        second: The same, or the name of a reference predictor (of a local split any
+            beside a predictions.nc, else the best one).
         metric: Metric to compare by; repeatable.
         every: Show every metric.
     """

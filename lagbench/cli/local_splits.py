@@ -149,6 +149,8 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
     lines = [
         f"{local_split.folder}: {', '.join(counts)}, {frames}, {particles}",
         f"  task    {given_frames} given, {local_split.horizon} to predict",
+        f"  time    {local_split.frame_interval:.6g} s between frames, "
+        f"from {local_split.interval_source}",
         f"  box     {box}",
         f"  hash    {local_split.dataset_sha256}",
         *_next_steps(local_split),

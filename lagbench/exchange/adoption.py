@@ -67,6 +67,7 @@ class _Judged:
     judgement: Judgement
     spacing: float | None  # measured in the first frame [length]; None for one particle
     interval: float  # time between two frames, as the user or the file says [s]
+    interval_name: str  # variable or attribute of the file that states it
     particles: int
     axes: tuple[int, ...]  # components that are not constant
     frames: int
@@ -174,7 +175,12 @@ def adopt(
             f"{counts['test']} trajectories for test: under {FEWEST_SCENARIOS} no "
             "difference between methods can be significant; --test puts more there"
         )
-    return replace(local_split, notes=tuple(notes))
+    interval_source = f"{judged['train'][0].interval_name} in the files"
+    if options.get("frame_interval") is not None:
+        interval_source = "--frame-interval"
+    elif "frame_interval" in stated:
+        interval_source = "metadata.json"
+    return replace(local_split, interval_source=interval_source, notes=tuple(notes))
 
 
 def _list_subsets(
@@ -226,10 +232,12 @@ def _list_subsets(
         test_count = max(1, total // 10, min(FEWEST_SCENARIOS, total // 3))
     train_count = total - valid_count - test_count
     if min(train_count, valid_count, test_count) < 1:
+        names = ", ".join(source.name for source in found[:3])
         raise UsageError(
             f"{total} trajectories, {valid_count} for valid and {test_count} for test, "
             "leave none for one of train, valid and test; give three or more, and "
-            "--valid and --test from 1"
+            f"--valid and --test from 1. There are {names}; a table of several frames "
+            "needs a column time"
         )
     ends = (0, train_count, train_count + valid_count, total)
     listings = {}
@@ -319,6 +327,7 @@ def _judge(
         spacing=estimate_spacing(first_frame[~is_wall], box, where=f"{name}, frame 0"),
         has_walls=bool(is_wall.any()),
         interval=interval,
+        interval_name=trajectory.interval_name,
         particles=len(trajectory.material),
         axes=trajectory.axes,
         frames=trajectory.frames,
@@ -422,6 +431,8 @@ def _complete(
                 "import them apart"
             )
     notes = []
+    if not first.states_kinds:
+        notes.append("no file has an array of kinds, so all particles are liquid")
     with_velocity = [member for member in members if member.has_velocity]
     if 0 < len(with_velocity) < len(members):
         notes.append(

@@ -134,12 +134,15 @@ class LocalSplit:
     materials: tuple[int, ...]  # numbers of the materials of all scenarios
     input_frames: int  # frames given to a model
     horizon: int  # frames to predict
+    frame_interval: float  # time between two frames [s]
     # the walls, or one period [length]: lowest and highest position along each axis
     bounds: Bounds
     periodic: tuple[str, ...]  # names of the axes without walls
     spacing: float  # distance of neighbouring particles at first [length]
     bytes: int  # length of the scenario files [bytes]
     dataset_sha256: str  # hash of the data set
+    # what states the frame interval: option, metadata.json, or variable of the files
+    interval_source: str = ""
     notes: tuple[str, ...] = ()  # what a user should know
 
 
@@ -255,6 +258,7 @@ def write_local_split(
         materials=tuple(sorted(writer.materials)),
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
+        frame_interval=float(description.frame_interval or 1.0),
         bounds=size.bounds,
         periodic=size.periodic,
         spacing=writer.spacings[0],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lagbench.data import PARTICLE_KINDS, WALL
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
-from .readers import reading
+from .readers import IDS, STEPS, TIMES, reading
 
 DIMENSIONS = {
     "time": ("time", "frame", "step", "t"),
@@ -25,9 +25,9 @@ DIMENSIONS = {
 NAMES = {
     "position": ("position", "positions", "pos"),
     "velocity": ("velocity", "velocities", "vel"),
-    "id": ("id", "ids", "particle_id", "particleid", "idp", "global_id", "tag"),
+    "id": IDS,
     "kind": ("material", "particle_type", "type", "types", "kind"),
-    "time": ("time", "times", "t"),
+    "time": (*TIMES, *STEPS),
     "interval": ("dt", "frame_interval"),
     "walls": ("wall_velocity",),
 }
@@ -74,6 +74,7 @@ class Trajectory:
     material: NDArray[np.int8]  # of each particle that is kept, [particle]
     is_kept: NDArray[np.bool_]  # of all particles, in the order of their ids
     interval: float | None  # time between two frames [s]
+    interval_name: str  # variable or attribute that states it; empty without
     # [length/s], [wall, axis] or [frame, wall, axis]; None without walls
     wall_velocity: NDArray[np.float64] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)  # options by name
@@ -157,6 +158,15 @@ def name_trajectory(
         found = _find(dataset, words)
         if found is not None:
             variables[purpose] = found
+    for purpose in ("id", "kind"):
+        array = dataset[variables[purpose]] if purpose in variables else None
+        if array is not None and set(array.dims) - {"time"} != {"particle"}:
+            shape = dataset[variables["position"]].shape
+            raise UsageError(
+                f"{name}: {array.name} has the shape {array.shape} and positions, by "
+                f"frame, particle and space, {shape}; give one for each particle, or "
+                "state the order of the axes, as in --axes particle,frame,space"
+            )
     if "id" in variables and dataset[variables["id"]].dims == ("particle",):
         ids = dataset[variables["id"]].values
         if len(np.unique(ids)) < len(ids):
@@ -169,7 +179,8 @@ def name_trajectory(
     if position.sizes["time"] < 2 or position.sizes["particle"] < 1:
         raise DataError(
             f"{name} has {position.sizes['time']} frames of "
-            f"{position.sizes['particle']} particles; a trajectory has two or more"
+            f"{position.sizes['particle']} particles; a trajectory has two or more, "
+            "which a column time tells apart in a table"
         )
     arrays = {"position": position.astype(np.result_type(position.dtype, np.float32))}
     dims = ("time", "particle", "space")
@@ -212,13 +223,15 @@ def name_trajectory(
             stated[key] = dataset.attrs[key]
     if isinstance(stated.get("periodic"), str):
         stated["periodic"] = stated["periodic"].split()
+    interval, interval_name = _find_interval(dataset, variables, name)
     return Trajectory(
         name=name,
         close=close,
         dataset=kept,
         material=material,
         is_kept=is_kept,
-        interval=_find_interval(dataset, variables, name),
+        interval=interval,
+        interval_name=interval_name,
         wall_velocity=walls,
         states_kinds="kind" in variables,
         stated=stated,
@@ -304,19 +317,23 @@ def _note_units(position: xr.DataArray, name: str) -> list[str]:
 
 def _find_interval(
     dataset: xr.Dataset, variables: Mapping[str, str], name: str
-) -> float | None:
-    """Return the time between two frames [s]; None where no variable says it.
+) -> tuple[float | None, str]:
+    """Return the time between two frames [s] and the name of what says it.
 
-    Whole numbers without a unit are numbers of steps: they must be even.
+    None where no variable says it. Whole numbers without a unit, and variables that are
+    named so, are numbers of steps: they must be even.
     """
     interval = None
+    source = ""
     for word in NAMES["interval"]:
         if word in dataset.attrs:
             interval = float(dataset.attrs[word])
+            source = word
     if "interval" in variables and dataset[variables["interval"]].size == 1:
-        interval = float(dataset[variables["interval"]])
+        source = variables["interval"]
+        interval = float(dataset[source])
     if "time" not in variables or dataset[variables["time"]].dims != ("time",):
-        return interval
+        return interval, source
     time = dataset[variables["time"]]
     values = time.values
     if values.dtype.kind in "mM":
@@ -340,14 +357,14 @@ def _find_interval(
             f"{steps.min():.4g} to {steps.max():.4g}: give frames in order, at even "
             "times"
         )
-    if time.dtype.kind in "iu" and not unit:
-        return interval
+    if variables["time"].lower() in STEPS or (time.dtype.kind in "iu" and not unit):
+        return interval, source
     if interval is not None and abs(interval - usual) > UNEVEN * usual:
         raise DataError(
             f"{name}: dt is {interval:.6g} and the times are {usual:.6g} apart; "
             "correct one of them"
         )
-    return usual
+    return usual, variables["time"]
 
 
 def _find_materials(
@@ -360,6 +377,11 @@ def _find_materials(
     """Return the material of each particle that is kept, and a mask over all."""
     count = dataset.sizes["particle"]
     if variable is None:
+        if kinds:
+            raise UsageError(
+                f"{name} has no array of kinds; leave --kinds out, or name the array "
+                f"{', '.join(NAMES['kind'])}"
+            )
         return np.zeros(count, np.int8), np.ones(count, bool), []
     array = dataset[variable]
     values = array.transpose(..., "particle").values
@@ -375,11 +397,6 @@ def _find_materials(
                 "keeps its material"
             )
         values = values[0]
-    if values.shape != (count,):
-        raise DataError(
-            f"{name}: {variable} has the shape {array.shape}; give one for each "
-            "particle"
-        )
     if values.dtype.kind == "f":
         if np.isnan(values).any():
             particle = int(np.argmax(np.isnan(values)))

@@ -43,6 +43,15 @@ AXES = ("frame", "particle", "space")
 H5_POSITIONS = ("position", "*/position", "particles")
 """Where HDF5 files of LagrangeBench, NeuralMPM and others keep positions."""
 
+TIMES = ("time", "times", "t")
+"""Names of times, in the order of preference."""
+
+STEPS = ("timestep", "step", "frame")
+"""Names of numbers of steps, which say no time."""
+
+IDS = ("id", "ids", "particle_id", "particleid", "idp", "global_id", "tag")
+"""Names of the identity of particles."""
+
 Frame = dict[str, Any]
 """Arrays of one frame by name, [particle, ...], and perhaps a number, time."""
 
@@ -195,7 +204,7 @@ def as_dataset(arrays: Mapping[str, Any], options: Reading) -> xr.Dataset:
     variables = {}
     for key, array in arrays.items():
         names = ["trajectory", "frame", "particle", "space"]
-        if array.ndim == 1 and key.lower() not in ("time", "times", "t"):
+        if array.ndim == 1 and key.lower() not in (*TIMES, *STEPS):
             names = ["trajectory", "particle", "frame", "space"]
         dims: list[str] = []
         for length in array.shape:
@@ -373,7 +382,8 @@ def _series(folder: Path, files: Sequence[Path]) -> Source:
         for file in files:
             yield from FRAMES[file.suffix.lower()](file)
 
-    return Source(name=str(folder), open=partial(_join, str(folder), frames))
+    name = f"{folder} ({len(files)} files, each taken for a frame)"
+    return Source(name=name, open=partial(_join, name, frames))
 
 
 def _holds_one_frame(path: Path) -> bool:
@@ -435,16 +445,22 @@ def _table_frames(path: Path) -> Iterator[Frame]:
         table = pd.read_csv(path, skipinitialspace=True)
     table.columns = table.columns.astype(str).str.strip()
     names = {name.lower(): name for name in table.columns}
-    time = next((names[word] for word in TIME_COLUMNS if word in names), None)
+    time = next((names[word] for word in (*TIMES, *STEPS) if word in names), None)
+    particle = next((names[word] for word in IDS if word in names), None)
+    if particle is not None:
+        keys = [key for key in (time, particle) if key is not None]
+        double = table.loc[table.duplicated(keys), keys]
+        if len(double):
+            row = " and ".join(f"{key} {double[key].iloc[0]}" for key in keys)
+            way_out = "keep one of them"
+            if time is None:
+                way_out += "; a table of several frames needs a column time"
+            raise DataError(f"{path}: two rows have {row}; {way_out}")
     if time is None:
         yield _columns_of(table)
         return
     for value, rows in table.groupby(time, sort=False):
-        yield {**_columns_of(rows), "time": value}
-
-
-TIME_COLUMNS = ("time", "t", "times", "timestep", "step", "frame")
-"""Columns of tables that say to which frame a row belongs."""
+        yield {**_columns_of(rows), time: value}
 
 
 def _columns_of(table: pd.DataFrame) -> Frame:

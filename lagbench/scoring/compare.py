@@ -52,6 +52,7 @@ from .tables import (
     show_number,
     with_interval,
 )
+from .task import SUBMISSION
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -233,7 +234,8 @@ def compare(
             - an entry of the leaderboard, as in ``cavity/full/neuralmpm``;
             - a predictions.nc, which is scored first.
         second: one of the same. Or a bare name: of a reference predictor (of a local
-            split the best one), or of an entry for the same data set.
+            split the best one, beside predictions any), or of an entry for the same
+            data set.
         metrics: one or more names of further metrics to compare. The ranking metric is
             always compared. By default all metrics whose direction tells better from
             worse.
@@ -255,6 +257,8 @@ def compare(
     if split is not None:
         expected_split, root, _ = locate_split(split, root=root, registry=registry)
 
+    measured: dict[str, dict[str, tuple[Score, ...]]] = {}  # beside predictions
+
     def load(name: str | Path) -> Contestant:
         seeds = []
         for path in find_scores(name, board):
@@ -272,6 +276,9 @@ def compare(
                         output_dir=scratch,
                     )
                     seed = read_statistics(card.files[1])
+                    for row in card.scores.keys() - {SUBMISSION}:
+                        scores = card.scores[row].items()
+                        measured[row] = {metric: (one,) for metric, one in scores}
             seeds.append(seed)
         contestant = _unite(str(name), seeds)
         found_split = contestant.identity["split"]
@@ -288,7 +295,7 @@ def compare(
     one = load(first)
     references = {}
     if is_bare:
-        references = _references_beside(one, registry)
+        references = _references_beside(one, registry) | measured
     is_reference = str(second) in references
     if is_reference:
         two = replace(

@@ -281,6 +281,27 @@ def test_a_stated_spacing_is_compared(tmp_path: Path) -> None:
     assert any("of the box along each axis" in note for note in own.notes)
 
 
+@pytest.mark.parametrize("name", ["kind", "id"])
+def test_an_array_of_each_particle_tells_of_exchanged_axes(
+    tmp_path: Path, name: str
+) -> None:
+    def save(path: Path, number: int) -> None:
+        position = vortex(number).transpose(1, 0, 2)
+        np.savez(path, position=position, **{name: np.arange(144)})
+
+    with pytest.raises(UsageError, match=rf"{name} has the shape.*--axes"):
+        adopt_runs(tmp_path, save)
+
+
+def test_kinds_without_an_array_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no array of kinds.*--kinds out"):
+        adopt_runs(tmp_path, saved(np.asarray), kinds="0=liquid,1=jelly")
+    (tmp_path / "again").mkdir()
+    own = adopt_runs(tmp_path / "again", saved(np.asarray))
+    assert own.materials == (0,)
+    assert any("all particles are liquid" in note for note in own.notes)
+
+
 def test_four_axes_need_their_order(tmp_path: Path) -> None:
     def save(path: Path, number: int) -> None:
         rng = np.random.default_rng(0)

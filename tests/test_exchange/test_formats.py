@@ -18,12 +18,13 @@ from foreign_files import (
     dataset_of,
     material_of,
     save_lammps,
+    table_of,
 )
 from trajectories import vortex
 
 from lagbench.baselines.predict import predict
 from lagbench.baselines.train import train
-from lagbench.errors import DataError, UnreadableFileError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.names import name_trajectory
@@ -130,6 +131,64 @@ def test_particles_that_enter_or_leave_are_refused(tmp_path: Path) -> None:
     for name, text in (("left.csv", "frame 5: 142"), ("other.npz", "frame 9: 1")):
         with pytest.raises(DataError, match=rf"{text} particles.*cut the trajectory"):
             adopt([tmp_path / name] * 3, output=tmp_path / "own", frame_interval=0.125)
+
+
+@pytest.mark.parametrize("column", ["time", "t"])
+def test_a_table_names_the_column_of_times(tmp_path: Path, column: str) -> None:
+    for number in range(3):
+        table = table_of(vortex(number)).rename(columns={"time": column})
+        table.to_csv(tmp_path / f"{number}.csv", index=False)
+    own = adopt(tmp_path, output=tmp_path / "own")
+    assert (own.frame_interval, own.interval_source) == (
+        INTERVAL,
+        f"{column} in the files",
+    )
+    assert not any("not used" in note for note in own.notes)
+    own = adopt(tmp_path, output=tmp_path / "again", frame_interval=INTERVAL)
+    assert own.interval_source == "--frame-interval"
+
+
+@pytest.mark.parametrize("column", ["step", "frame", "timestep"])
+def test_numbers_of_steps_are_no_times(tmp_path: Path, column: str) -> None:
+    """As decimal numbers, too; they must be even."""
+    tables = []
+    for number in range(3):
+        table = table_of(vortex(number)).rename(columns={"time": column})
+        tables.append(table.assign(**{column: 10 * table[column] / INTERVAL}))
+        tables[-1].to_csv(tmp_path / f"{number}.csv", index=False)
+    with pytest.raises(UsageError, match="--frame-interval"):
+        adopt(tmp_path, output=tmp_path / "own")
+    own = adopt(tmp_path, output=tmp_path / "own", frame_interval=0.01)
+    assert own.frame_interval == 0.01
+    gap = tables[0][tables[0][column] != 50]
+    gap.to_csv(tmp_path / "0.csv", index=False)
+    with pytest.raises(DataError, match=r"frame 5.*even"):
+        adopt(tmp_path, output=tmp_path / "again", frame_interval=0.01)
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        (["time"], r"two rows have id .*a column time"),
+        (["time", "id"], r"3 files, each taken for a frame.*a column time"),
+    ],
+)
+def test_a_table_without_times_is_a_frame(
+    tmp_path: Path, columns: list[str], text: str
+) -> None:
+    for number in range(3):
+        table = table_of(vortex(number)).drop(columns=columns)
+        table.to_csv(tmp_path / f"{number}.csv", index=False)
+    with pytest.raises(LagbenchError, match=text):
+        adopt(tmp_path, output=tmp_path / "own")
+
+
+def test_a_double_row_is_named(tmp_path: Path) -> None:
+    table = table_of(vortex(0)).reset_index(drop=True)
+    double = table[(table["time"] == 5 * INTERVAL) & (table["id"] == 7)]
+    pd.concat([table, double]).to_csv(tmp_path / "run.csv", index=False)
+    with pytest.raises(DataError, match=r"two rows have time 0\.625 and id 7"):
+        adopt([tmp_path / "run.csv"] * 3, output=tmp_path / "own")
 
 
 def test_datasets_are_adopted_without_files(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from lagbench.baselines.train import train
 from lagbench.errors import DataError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
+from lagbench.scoring.compare import compare
 from lagbench.scoring.score import score
 
 SEEDS = {"train": 0, "valid": 1, "test": 2}
@@ -100,6 +101,9 @@ def test_scores_leave_walls_out(own: LocalSplit, tmp_path: Path) -> None:
         card = score(path, root=own.folder.parent, write=False)
         results.append(card.scores["submission"]["position_rmse"].values)
         assert "persistence" in card.scores
+        for reference in card.scores.keys() - {"submission"}:
+            result = compare(path, reference, split=own.folder)
+            assert result.second == reference
     np.testing.assert_array_equal(results[0], results[1])
     assert results[0] == pytest.approx(0.001, rel=1e-3)
 
