@@ -50,7 +50,7 @@ def build_registered(
     info = read_dataset_info(split, size, root=root, registry=registry)
     model = find(baseline).model
     stated = dict(options or {})
-    check_options(model.Options, stated, "options")
+    check_options(model.Options, stated, "options", group="model")
     return model.build(stated, info)
 
 
