@@ -30,7 +30,7 @@ PICTURE = Path("docs/figures/samples.svg")
 
 
 @dataclass(frozen=True)
-class Validation:
+class TrainedError:
     """The error of a network on ``valid`` in the course of a training."""
 
     split: str
@@ -76,7 +76,7 @@ def train_all(options: argparse.Namespace) -> None:
             log = json.loads((folder / "training.json").read_text())
             windows = log["windows_seen"] / log["steps"]  # a step
             rows = [
-                Validation(
+                TrainedError(
                     options.split,
                     model,
                     count,
@@ -92,12 +92,12 @@ def train_all(options: argparse.Namespace) -> None:
             sys.stderr.write(f"{place}: {result.best_value}\n")
 
 
-def place_of(row: Validation) -> tuple[str, str, int, int]:
+def place_of(row: TrainedError) -> tuple[str, str, int, int]:
     """Return what a training is told by."""
     return row.split, row.model, row.scenarios, row.seed
 
 
-def read_table() -> list[Validation]:
+def read_table() -> list[TrainedError]:
     """Read the table; nothing where there is none."""
     if not TABLE.is_file():
         return []
@@ -105,7 +105,7 @@ def read_table() -> list[Validation]:
     with TABLE.open(newline="") as file:
         for row in csv.DictReader(file):
             rows.append(
-                Validation(
+                TrainedError(
                     row["split"],
                     row["model"],
                     int(row["scenarios"]),
@@ -117,10 +117,10 @@ def read_table() -> list[Validation]:
     return rows
 
 
-def write_table(rows: list[Validation]) -> None:
+def write_table(rows: list[TrainedError]) -> None:
     """Write the table, sorted."""
     with TABLE.open("w", newline="") as file:
-        writer = csv.DictWriter(file, Validation.__annotations__, lineterminator="\n")
+        writer = csv.DictWriter(file, TrainedError.__annotations__, lineterminator="\n")
         writer.writeheader()
         for row in sorted(rows, key=lambda row: (*place_of(row), row.windows)):
             writer.writerow({**asdict(row), "error": round(row.error, 5)})
