@@ -6,7 +6,7 @@ Runs each command in this process on a made-up root and prints in how many files
 a function ran, and how many functions: class bodies, child processes and what runs
 while a module is imported are left out. Then what the source says: files, lines,
 comments, the longest chain of imports. With --files it also lists the files of each
-command and the modules of the chain. Its table stands in CONTRIBUTING.md.
+command and the modules of the chain.
 """
 
 from __future__ import annotations

@@ -172,7 +172,8 @@ def test_sums_hold_every_particle_in_one_place() -> None:
     state = with_velocity(state, speed * everywhere, no_gradient)
     result = after(INERT, [state], 1)
     nodes = result["grid_velocity"][0]
-    around_the_spot = nodes[19:22, 19:22]
+    around_the_spot = nodes[nodes.any(axis=-1)]
+    assert len(around_the_spot) == 9
     assert_allclose(around_the_spot, speed, rtol=1e-6)
 
 
@@ -255,7 +256,6 @@ def test_states_outside_the_bounds_are_refused() -> None:
         {"position": state.position.astype(str)},
         {"position": state.position + 5.0},
         {"area": 0.0},
-        {"area": None},
     ):
         odd_state = dataclasses.replace(state, **odd)
         with pytest.raises(UsageError):
