@@ -66,16 +66,17 @@ def _best_reference(card: ScoreCard) -> list[str]:
 def _over_horizon(
     card: ScoreCard, names: Collection[str], references: Collection[str]
 ) -> Table:
-    """Return the table of scores over the horizon."""
+    """Return the table of scores over the horizon, the first reference first."""
     skill_cell = "-"
     best = None
     if card.skill is not None:
         skill_cell = with_interval(card.skill.value, card.skill.interval)
         best = card.skill.reference
     zeros = ["0" if row == best else "" for row in references]
-    rows = [("skill ↑", skill_cell, *zeros)]
+    rows = [("skill ↑", *zeros[:1], skill_cell, *zeros[1:])]
     if isinstance(card.speedup, Speedup):
-        rows.append(("speedup ↑", str(card.speedup), *[""] * len(references)))
+        empty = [""] * len(references)
+        rows.append(("speedup ↑", *empty[:1], str(card.speedup), *empty[1:]))
     for name in names:
         score = card.submission[name]
         cell = with_interval(score.mean, score.interval)
@@ -85,12 +86,13 @@ def _over_horizon(
         for row in references:
             reference = card.scores[row].get(name)
             means.append("-" if reference is None else show_number(reference.mean))
-        rows.append((label_metric(score.metric), cell, *means))
+        rows.append((label_metric(score.metric), *means[:1], cell, *means[1:]))
 
     task = f"{card.data_name}, {card.config.horizon} frames"
     title = f"{card.header.method} on {task}, mean over scenarios"
     heads = [break_name(row) for row in references]
-    return Table(title, ("metric", f"{SUBMISSION} [95 %]", *heads), tuple(rows))
+    own = f"{SUBMISSION} [95 %]"
+    return Table(title, ("metric", *heads[:1], own, *heads[1:]), tuple(rows))
 
 
 def label_metric(metric: Metric) -> str:

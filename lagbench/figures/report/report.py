@@ -111,9 +111,8 @@ def render(subject: Subject) -> str:
     for entry in subject.entries:
         brief_tables.append(brief_table(entry.card))
         all_tables += card_tables(entry.card)
-        lines += (
-            f"{entry.name}: {line}" for line in card_lines(entry.card, every=True)
-        )
+        prefix = f"{entry.name}: " if len(subject.entries) > 1 else ""
+        lines += (f"{prefix}{line}" for line in card_lines(entry.card, every=True))
     return environment.get_template("page.html").render(
         policy=POLICY,
         subject=subject,
