@@ -121,8 +121,10 @@ def _draw_means(
         if name == "position_rmse":
             limit = np.asarray(subject.task.predictability_limit)
             if len(limit) == len(subject.frames):
-                label = "perturbed solver"
-                axes.plot(subject.frames, limit, ":", color=INK, lw=1, label=label)
+                name_of_limit = "perturbed solver"
+                axes.plot(
+                    subject.frames, limit, ":", color=INK, lw=1, label=name_of_limit
+                )
         if name == "vorticity_pearson":
             axes.axhline(STABLE_PEARSON, color=MUTED, lw=0.8, ls=":")
             axes.set_ylim(top=1.0)
